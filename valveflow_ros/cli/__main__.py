@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""So that ``python -m valveflow_ros.cli`` is the command."""
+"""Entry point of ``python -m valveflow_ros.cli``."""
 
 import sys
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the verbs share: options, messages and progress on the terminal, the result."""
+"""Functions shared by the verbs: options, messages, progress on the terminal, the result."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.files import Result
     from valveflow_ros.interface.mapping import LogMapping
 
-# What commands a terminal, or turns the order of what it shows: all but tabs and line feeds.
+# Terminal control characters and those that change the text direction, except tabs and newlines.
 _COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
 
-# How long each part of a verb's work takes beside the others, so that a bar moves evenly: name
-# of the part, the shares a verb tells at its begin and end, and where it begins in the time.
-# Measured with ``benchmarks/pace.py`` on logs of one and three days; it is the proportions that
-# count.
+# Relative durations of the parts of a verb's work, so that the bar moves evenly: name of the part,
+# the fractions that the verb reports at its begin and end, and the fraction of the time at its
+# begin. Measured with ``benchmarks/pace.py`` on logs of one and three days; only the proportions
+# matter.
 _PARTS: Mapping[str, Sequence[tuple[str, float, float, float]]] = {
     'identify': (
         ('starting', 0.0, 0.0, 0.0),
@@ -81,9 +81,9 @@ _PARTS: Mapping[str, Sequence[tuple[str, float, float, float]]] = {
 
 
 def share_of_time(verb: str, told: float, what: str) -> float:
-    """Return the share of a verb's time that has gone by when ``told`` of ``what`` is done.
+    """Return the fraction of a verb's time that has passed at fraction ``told`` of step ``what``.
 
-    What is not in the table stays as it is told.
+    A step that is not in the table is returned unchanged.
     """
     rows = _PARTS.get(verb, ())
     for k, (name, told_from, told_to, begins) in enumerate(rows):
@@ -97,17 +97,17 @@ def share_of_time(verb: str, told: float, what: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class VerbResult:
-    """What a verb has to say at its end.
+    """The result of a verb.
 
     Attributes
     ----------
     text : str
-        For a person.
+        For people.
     data : mapping
-        The same for a program; what is not finite becomes null.
+        The same for programs; values that are not finite become null.
     drawn : bool
-        The text is a picture that was made for this terminal, colours and all, of words that were
-        made harmless. Any other text is printed without what commands a terminal.
+        The text is a picture for this terminal, with control codes, made from sanitised words.
+        Terminal control characters are removed from any other text.
     """
 
     text: str
@@ -116,7 +116,7 @@ class VerbResult:
 
 
 class Console(Progress):
-    """Messages, warnings, a progress bar where there is a terminal, and the result.
+    """Messages, warnings, a progress bar on a terminal, and the result.
 
     Parameters
     ----------
@@ -124,9 +124,9 @@ class Console(Progress):
     as_json : bool
         Print the result as JSON.
     quiet : bool
-        Say nothing but warnings and the result.
+        Print only warnings and the result.
     verb : str
-        Whose work it is.
+        Name of the verb.
     """
 
     def __init__(
@@ -141,25 +141,25 @@ class Console(Progress):
         self._line = ProgressLine(err, bar, lambda told, what: share_of_time(verb, told, what))
 
     def __call__(self, share: float, what: str) -> None:
-        """Show the progress: a bar on a terminal, anywhere else a line once it takes long."""
+        """Show the progress: a bar on a terminal, otherwise a line if the work takes long."""
         if not self._quiet:
             self._line.at(share, _harmless(what))
 
     def measured_in(self, unit: str) -> None:
-        """Print everything from now on as about an output in this unit."""
+        """Print all further texts for an output in this unit."""
         self._unit = unit
 
     def say(self, sentence: str) -> None:
-        """Print something that is good to know."""
+        """Print an informative message."""
         if not self._quiet:
             self._line.write(_harmless(self._told(sentence)))
 
     def warn(self, sentence: str) -> None:
-        """Print something that must not be overlooked."""
+        """Print a warning."""
         self._line.write(_harmless(f'Warning: {self._told(sentence)}'))
 
     def fail(self, sentence: str) -> None:
-        """Print why it could not be done."""
+        """Print why the command failed."""
         self._line.end()
         self._line.write(_harmless(f'valveflow: {self._told(sentence)}'))
 
@@ -184,12 +184,12 @@ class Console(Progress):
 
 
 def _harmless(text: str) -> str:
-    """Return a text as it may go to a terminal: names and cells of others may stand in it."""
+    """Return a text safe for a terminal: it may contain external names and table cells."""
     return _COMMANDS.sub('?', text)
 
 
 def _finite(value: Any) -> Any:
-    """Replace what JSON does not know."""
+    """Replace values that JSON does not have."""
     if isinstance(value, Mapping):
         return {str(k): _finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -200,7 +200,7 @@ def _finite(value: Any) -> Any:
 
 
 class TableOption(NamedTuple):
-    """An option that says how a table is written, among those of ``--column``."""
+    """An option on the format of a table, in the list of ``--column``."""
 
     option: str
     value: str
@@ -221,9 +221,9 @@ Columns of a table that are named after what they hold need no --column."""
 
 
 def add_mapping(parser: ArgumentParser) -> None:
-    """Add the options that say how a log is to be understood.
+    """Add the options on how to read a log.
 
-    Those about tables are gathered in the same list as ``--column``, in their order.
+    Those about tables are collected in the same list as ``--column``, in their order.
     """
     parser.epilog = MAPPING_HELP
     parser.add_argument(
@@ -239,7 +239,7 @@ def add_mapping(parser: ArgumentParser) -> None:
 
 
 def add_table(parser: ArgumentParser, gathered: str) -> None:
-    """Add the options that say how a table is written, to be gathered under this name."""
+    """Add the options on the format of a table, collected under the name ``gathered``."""
     parser.set_defaults(**{gathered: []})
     about = parser.add_argument_group('how a table is written, where it does not show it itself')
     for option, metavar, told in (
@@ -267,7 +267,7 @@ def _table_option(option: str) -> Callable[[str], TableOption]:
 
 
 def mapping_of(options: Namespace) -> LogMapping:
-    """Read the options of `add_mapping`; raises `UsageError`."""
+    """Return the mapping from the options of `add_mapping`; raises `UsageError`."""
     from valveflow_ros.interface.mapping import read_mapping
 
     columns = [c for c in options.column if isinstance(c, str)]
@@ -275,12 +275,12 @@ def mapping_of(options: Namespace) -> LogMapping:
 
 
 def table_words(gathered: Sequence[str | TableOption]) -> dict[str, str]:
-    """Return what `add_table` gathered, by the names of `table_options`."""
+    """Return the options collected by `add_table`, by the names of `table_options`."""
     return {o.option.replace('-', '_'): o.value for o in gathered if isinstance(o, TableOption)}
 
 
 def add_analysis(parser: ArgumentParser, log: str = 'the log to read') -> None:
-    """Add the log an analysis is of, and the folder of its results."""
+    """Add the log of an analysis, and the folder of its results."""
     parser.add_argument('log', metavar='LOG', type=Path, help=log)
     parser.add_argument(
         '-o', '--output', metavar='DIR', type=Path, required=True,
@@ -289,7 +289,7 @@ def add_analysis(parser: ArgumentParser, log: str = 'the log to read') -> None:
 
 
 def add_analysis_options(parser: ArgumentParser) -> None:
-    """Add what every analysis takes: parameters, files beside the report, how to read the log."""
+    """Add the options of every analysis: parameters, additional files, how to read the log."""
     parser.add_argument(
         '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
     )
@@ -309,7 +309,7 @@ def add_analysis_options(parser: ArgumentParser) -> None:
 
 
 def checked_parameters(options: Namespace) -> dict[str, Any]:
-    """Return the parameters a person has set; refuse before long work what cannot be written.
+    """Return the parameters set by the user; raise early if the results could not be written.
 
     Raises
     ------
@@ -326,12 +326,12 @@ def checked_parameters(options: Namespace) -> dict[str, Any]:
 def write_results(
     result: Result, options: Namespace, text: str, data: Mapping[str, Any]
 ) -> VerbResult:
-    """Write the files of a result; return its text and data with what was written.
+    """Write the files of a result; return its text and data with the list of the files.
 
     Raises
     ------
     RecordingError
-        They cannot be written.
+        The files cannot be written.
     """
     from valveflow_ros.records import zone_of
     from valveflow_ros.report.words import in_zone
@@ -347,7 +347,7 @@ def write_results(
 
 
 def time_ns(text: str) -> int:
-    """Return a time in ns, in UTC where it names no zone."""
+    """Return a time in ns; UTC if it gives no zone."""
     try:
         moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
     except ValueError:
@@ -357,12 +357,12 @@ def time_ns(text: str) -> int:
 
 
 def lines(*parts: str) -> str:
-    """Return the parts that are not empty, one below the other."""
+    """Return the parts that are not empty, one per line."""
     return '\n'.join(part for part in parts if part)
 
 
 def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str = '  ') -> str:
-    """Return rows with their columns lined up; the first column left, the others right."""
+    """Return rows with aligned columns; the first column left, the others right."""
     everything = [list(head), *map(list, rows)] if head else [list(r) for r in rows]
     if not everything:
         return ''
@@ -376,7 +376,7 @@ def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str
 
 
 def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
-    """Return one line about the readings that were not used, per signal."""
+    """Return one line per signal about the readings that were not used."""
     from valveflow_ros.report.data import REASON_WORDS, rejected
     from valveflow_ros.report.words import count
 

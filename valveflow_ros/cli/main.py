@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The command: choose the verb, read its options, run it, turn what happens into a status."""
+"""The command: select the verb, parse its options, run it, return the exit status."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from valveflow_ros.errors import LOADING_BYTES, UsageError, ValveflowError, chec
 from valveflow_ros.interface.files import check_folder, check_readable, check_writable
 
 DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
-# As a shell tells of a process that a signal has ended: 130 after Ctrl-C.
+# Exit status of a process ended by a signal, as in a shell: 130 after Ctrl-C.
 _SIGNALLED = 128
-# A second signal within so many seconds is the same wish: the clean-up must not be cut short.
+# A second signal within this many seconds is ignored, so that the clean-up is completed.
 _ONCE_S = 2.0
 
-# In the order in which a newcomer needs them: verb, module, what it does.
+# In the order in which a new user needs them: verb, module, description.
 VERBS: tuple[tuple[str, str, str], ...] = (
     (
         'simulate',
@@ -70,17 +70,17 @@ A log is an .mcap file, a rosbag2 folder, or a table: .csv, .xlsx or .parquet.
 
 
 class Verb(Protocol):
-    """What the module of a verb offers."""
+    """The interface of the module of a verb."""
 
     def arguments(self, parser: ArgumentParser) -> None:
         """Add description, example and options."""
 
     def run(self, options: Namespace, console: Console) -> VerbResult:
-        """Do it."""
+        """Run the verb."""
 
 
 def overview() -> str:
-    """Return what ``valveflow`` says without a verb."""
+    """Return the text for ``valveflow`` without a verb."""
     lines = [f'  valveflow {name:<11} {about}' for name, _, about in VERBS]
     return OVERVIEW.format(verbs='\n'.join(lines))
 
@@ -91,7 +91,7 @@ def load(name: str) -> Verb:
     Raises
     ------
     UsageError
-        There is no such verb; the sentence names the nearest one.
+        There is no such verb; the message names the most similar one.
     """
     for verb, module, _ in VERBS:
         if verb == name:
@@ -103,7 +103,7 @@ def load(name: str) -> Verb:
 
 
 class Parser(ArgumentParser):
-    """A parser that refuses with `UsageError` and keeps the layout of what we wrote."""
+    """A parser that raises `UsageError` and keeps the layout of the help texts."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog=prog, formatter_class=_Formatter, allow_abbrev=False, add_help=False)
@@ -111,7 +111,7 @@ class Parser(ArgumentParser):
         self.add_argument('-h', '--help', action='help', help='show this page')
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; an option that does not exist is told before anything that is missing."""
+        """Parse; an unknown option is reported before a missing one."""
         for word in [] if args is None else list(args):
             if word == '--':
                 break
@@ -124,7 +124,7 @@ class Parser(ArgumentParser):
         return super().parse_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Refuse what argparse found wrong, as a sentence."""
+        """Raise the error of argparse as a sentence."""
         missing = message.removeprefix('the following arguments are required: ')
         if missing != message:
             *most, last = missing.split(', ')
@@ -141,7 +141,7 @@ class Parser(ArgumentParser):
 
 
 def _sentence(message: str) -> str:
-    """Put what argparse says into words: the option first, then what is wrong with it."""
+    """Rewrite a message of argparse: the option first, then its error."""
     about = re.fullmatch(r'argument (\S+): (.*)', message, re.DOTALL)
     if about is None:
         return message[:1].upper() + message[1:]
@@ -173,14 +173,14 @@ def parser_of(name: str, verb: Verb | None = None) -> Parser:
 
 
 def check_paths(parser: ArgumentParser, options: Namespace) -> None:
-    """Refuse, before anything is loaded, options that name what cannot be read or written.
+    """Raise early if the path in an option cannot be read or written.
 
-    What is wrong within a file is for the verb to say.
+    The content of files is checked by the verb.
 
     Raises
     ------
     RecordingError
-        The first of them, with the reason.
+        For the first of them, with the reason.
     """
     for action in parser._actions:
         path = getattr(options, action.dest, None)
@@ -188,7 +188,7 @@ def check_paths(parser: ArgumentParser, options: Namespace) -> None:
             continue
         if action.metavar == 'DIR':
             check_folder(path)
-        elif action.dest == 'truth' and 'seed' in options:  # the only FILE that is written
+        elif action.dest == 'truth' and 'seed' in options:  # the only FILE option for output
             check_writable(path)
         elif action.metavar == 'FILE' and action.dest != 'output':
             check_readable(path.expanduser(), 'cannot be read')
@@ -197,12 +197,12 @@ def check_paths(parser: ArgumentParser, options: Namespace) -> None:
 
 
 class Stop:
-    """Turns signals into `KeyboardInterrupt` and remembers the first.
+    """Turns signals into `KeyboardInterrupt` and stores the first.
 
     Attributes
     ----------
     number : int
-        The signal that came; 0: none.
+        The received signal; 0 if none.
     """
 
     def __init__(self) -> None:
@@ -214,16 +214,16 @@ class Stop:
         if self.number and now - self._at_s < _ONCE_S:
             return
         self.number, self._at_s = number, now
-        # Half-made objects of libraries complain when they are cleared away; ignore that.
+        # Incomplete objects of libraries may raise errors when they are deleted; ignore them.
         sys.unraisablehook = lambda _: None
         raise KeyboardInterrupt
 
     @contextmanager
     def listening(self) -> Iterator[Stop]:
-        """Handle the signals within a block; the handlers before come back after it."""
+        """Handle the signals within a block; the earlier handlers are restored after it."""
         before: dict[int, object] = {}
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # A shell lets what it starts in the background ignore Ctrl-C, and nohup a hang-up.
+            # Background jobs of a shell ignore Ctrl-C, and nohup ignores a hang-up: keep this.
             if signal.getsignal(number) == signal.SIG_IGN:
                 continue
             with suppress(ValueError):  # not in the main thread
@@ -241,12 +241,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments : sequence of str, optional
-        Without the program's name; those of the process by default.
+        Without the program name; those of the process by default.
 
     Returns
     -------
     int
-        0 done, 1 could not be done, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
+        0 success, 1 failure, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
     """
     if '_ARGCOMPLETE' in os.environ:
         from valveflow_ros.cli.verbs.completion import complete
@@ -257,8 +257,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words,
         verb=words[0] if words else '',
     )  # fmt: skip
-    # Compiling makes millions of objects that stay: looking for garbage among them as often as
-    # usual takes a tenth of the first run.
+    # Compilation creates millions of permanent objects: garbage collection with the usual
+    # frequency takes a tenth of the time of the first run.
     gc.set_threshold(50_000, 20, 50)
     with Stop().listening() as stop:
         return _guarded(words, console, stop)
@@ -277,13 +277,13 @@ def _guarded(words: list[str], console: Console, stop: Stop) -> int:
     except KeyboardInterrupt:
         return _stopped(console, stop)
     except BrokenPipeError:
-        # The reader of the output has gone; nobody is left to tell.
+        # The reader of the output has closed it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except MemoryError:
         console.fail('There is not enough memory for this log; use a shorter part of it.')
     except Exception as error:  # noqa: BLE001 - the last line: a person gets a sentence
         if stop.number:
-            # Libraries that were interrupted while they load raise errors of their own.
+            # Libraries that are interrupted during import raise other errors.
             return _stopped(console, stop)
         _show_traceback()
         console.fail(_unforeseen(error))
@@ -312,10 +312,10 @@ def _command(words: list[str], console: Console) -> int:
     parser = parser_of(words[0], verb)
     try:
         options = parser.parse_args(words[1:])
-    except SystemExit as done:  # --help was asked for
+    except SystemExit as done:  # --help
         sys.stdout.flush()
         return int(done.code or DONE)
-    # watch waits for what is not there yet, and says so itself.
+    # watch waits for missing paths and reports them itself.
     if words[0] != 'watch':
         check_paths(parser, options)
     console.finish(verb.run(options, console))
@@ -336,7 +336,7 @@ def _show_traceback() -> None:
 
 
 def _unforeseen(error: Exception) -> str:
-    """Return one sentence for an error nobody foresaw, or one of the operating system."""
+    """Return a sentence for an unexpected error, or one of the operating system."""
     if isinstance(error, OSError) and error.strerror:
         named = f'{error.filename}: ' if error.filename else ''
         return f'{named}{error.strerror.lower()}.'

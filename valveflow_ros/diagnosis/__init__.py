@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the simulation gets wrong: the cause, the extended model, the gain."""
+"""Diagnosis: the cause of a model error, the extended model and its gain in accuracy."""

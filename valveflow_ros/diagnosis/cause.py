@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a cause is: a change of the model with parameters, and a way to look for it."""
+"""Definition of a cause: a parametric change of the model and a method to search for it."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from valveflow_ros.diagnosis.grids import Covariate, Grids
 from valveflow_ros.records import NS_PER_S, BoolArray
 from valveflow_ros.signals.static_form import StaticForm
 
-# A number with its 95 % interval, and how a time is told: as dates in UTC.
+# A number with its 95 % interval, and the output of times as UTC dates.
 
 DAY_S = 86_400.0
 _DAY, _HOUR, _MINUTE = 86_400, 3_600, 60
 _STEPS = (_DAY, _HOUR, 10 * _MINUTE)
-_OF_INTERVAL = 5  # an interval is told in steps of at most a fifth of its length
+_OF_INTERVAL = 5  # interval ends are rounded to at most a fifth of the interval length
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value with its 95 % interval; ``low`` and ``high`` are NaN where not known.
+    """A value with its 95 % interval; ``low`` and ``high`` are NaN if unknown.
 
     Attributes
     ----------
     value, low, high : float
     unit : str
     origin_ns : int or None
-        Of a time in days: what it counts from, ns since 1970 UTC. None: it is no time.
+        For a time in days: its origin, ns since 1970 UTC. None: the value is not a time.
     """
 
     value: float
@@ -45,27 +45,27 @@ class Estimate:
 
     @property
     def full_unit(self) -> str:
-        """Return the unit; of a time with what it counts from: 'days since 2025-03-04 ...'."""
+        """Return the unit; a time includes its origin: 'days since 2025-03-04 ...'."""
         if self.origin_ns is None:
             return self.unit
         return f'days since {_written(self.origin_ns // NS_PER_S, "s")} UTC'
 
     @property
     def known(self) -> bool:
-        """Tell whether there is an interval."""
+        """Return True if there is an interval."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
 
 def dates(e: Estimate) -> tuple[str, str]:
-    """Return a time and its interval as dates, '' where there is no interval.
+    """Return a time and its interval as dates; the second is '' if there is no interval.
 
-    They are told to the minute, of long intervals to ten minutes, an hour or a day. The ends of
-    the interval are rounded outwards, so that it goes on covering what it covers.
+    Times are given to the minute; with a long interval to ten minutes, an hour or a day. The ends
+    of the interval are rounded outwards, so that it keeps its coverage.
 
     Raises
     ------
     ValueError
-        The estimate is no time.
+        The estimate is not a time.
     """
     if e.origin_ns is None:
         raise ValueError('This estimate is no time.')
@@ -78,14 +78,14 @@ def dates(e: Estimate) -> tuple[str, str]:
 
 
 def told(origin_ns: int, after_s: float, step_s: int = _MINUTE) -> str:
-    """Write a time rounded to a step: '2025-03-04 05:06 UTC', of whole days '2025-03-04'.
+    """Return a time rounded to a step: '2025-03-04 05:06 UTC'; '2025-03-04' for whole days.
 
     Parameters
     ----------
     origin_ns : int
         Ns since 1970 UTC.
     after_s : float
-        How long after it.
+        Time after the origin.
     """
     second = origin_ns // NS_PER_S + math.floor(after_s + 0.5 * step_s)
     rounded = second - second % step_s
@@ -102,30 +102,30 @@ def _step_s(width_s: float) -> int:
 
 Values = tuple[float, ...]
 U_UNIT = '% MPa^m'
-_OPENING_UNIT = 0.04  # % of opening move as much as one unit of V p^m does
+_OPENING_UNIT = 0.04  # this many % of opening correspond to one unit of V p^m
 
 
 def axis_unit(form: StaticForm) -> float:
-    """Return how much of the axis of a form is as much as one unit of V p^m."""
+    """Return the length on the axis of a form that corresponds to one unit of V p^m."""
     return _OPENING_UNIT if form.scaled else 1.0
 
 
-# So near to the end of what a plant can have the data ask for something else.
+# A value above this fraction of its upper bound suggests that the cause is another one.
 _END = 0.95
 _Z95 = 1.959963984540054
 
 
 class Stage(enum.IntEnum):
-    """Where in the plant a cause acts, from the position sensor to the power meter.
+    """Place in the plant where a cause acts, from the position sensor to the power meter.
 
-    What ``act`` of a cause takes and returns:
+    Arguments and result of ``act`` of a cause:
 
-    - ``OPENING``: (v in % (nn,), values, grids) to the opening behind the fault
-    - ``INPUT``: (u (n,), values, grids, model) to a factor on u
-    - ``FLOW``: (u (n,), values, grids) to MW added to x = F(u)
-    - ``GAIN``: (values, grids, extra) to a factor on x
-    - ``DYNAMICS``: (model, values) to a model with other dynamics
-    - ``OUTPUT``: (y (n,) in MW, values, grids) to the power shown
+    - ``OPENING``: (v in % (nn,), values, grids) -> the opening downstream of the fault
+    - ``INPUT``: (u (n,), values, grids, model) -> a factor on u
+    - ``FLOW``: (u (n,), values, grids) -> MW added to x = F(u)
+    - ``GAIN``: (values, grids, extra) -> a factor on x
+    - ``DYNAMICS``: (model, values) -> a model with other dynamics
+    - ``OUTPUT``: (y (n,) in MW, values, grids) -> the measured power
     """
 
     OPENING = 0
@@ -153,16 +153,16 @@ class Unknown:
     ----------
     name, unit : str
     step : float
-        For differences; about a tenth of what matters.
+        Step for finite differences; about a tenth of a relevant change.
     low, high : float
-        Bounds of what a plant can have.
+        Bounds of plausible values.
     kind : Kind
-        ``LINE`` parameters are moved by a line search that begins with ``step`` (the cost
-        is not smooth in them), ``HELD`` ones not at all, the others by Gauss-Newton.
+        ``LINE`` parameters are found by a line search with first step ``step`` (the cost is
+        not smooth in them). ``HELD`` ones stay fixed. The others are found by Gauss-Newton.
     concealed : float
-        How much larger it may be without showing in any record; belongs to its interval.
+        Part of it that has no effect on any record; added to the upper end of the interval.
     dated : bool
-        It is a time in days after the first row, and people are told its date.
+        True for a time in days after the first row; users see it as a date.
     """
 
     name: str
@@ -175,7 +175,7 @@ class Unknown:
     dated: bool = False
 
     def on(self, form: StaticForm) -> Unknown:
-        """Return it for curves of a form; a place on the curve is in the unit of their axis."""
+        """Return the parameter for a form; positions on the curve are in the unit of its axis."""
         if self.unit != U_UNIT or not form.scaled:
             return self
         one = axis_unit(form)
@@ -191,14 +191,14 @@ class Unknown:
 
 
 class SentenceValues(dict[str, float]):
-    """Values by name, for a sentence.
+    """Parameter values by name, for a sentence.
 
     Attributes
     ----------
     onset : str
-        When it set in, as a date with its interval; empty for a cause without an onset.
+        Date of the onset with its interval; empty for a cause without an onset.
     unsure : frozenset of str
-        Names of values that their standard error exceeds.
+        Names of values that are smaller than their standard error.
     """
 
     def __init__(
@@ -211,11 +211,11 @@ class SentenceValues(dict[str, float]):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Values to begin a full fit from, and what screening expects of them.
+    """Initial values for a full fit and their expected gain.
 
-    ``gain`` is a log-likelihood on the open blocks; ``extra`` holds what is not a number
-    to be fitted (the times of switches); ``base`` is the curve and the dynamics to begin with
-    where those of the plain model have swallowed much of the cause.
+    ``gain`` is the gain in log-likelihood on the open blocks. ``extra`` holds values that are not
+    fitted as numbers (the switching times). ``base`` gives the initial curve and dynamics if those
+    of the plain model already explain much of the cause.
     """
 
     values: Values
@@ -231,23 +231,23 @@ class Cause:
     Attributes
     ----------
     name : str
-        The catalogue's word.
+        Name in the catalogue.
     family : str
-        Causes of one family are always tried against each other.
+        Causes of one family are always compared with each other.
     stage : Stage
     unknowns : tuple of Unknown
     act : callable
         See `Stage`.
     starts : callable
-        Takes the `Screening` and returns promising values, none if there are none.
+        Takes the `Screening` and returns promising initial values; empty if there are none.
     sentence : callable
-        Takes what is to be told (see `SentenceValues`) and says what is wrong, for an operator.
+        Takes `SentenceValues` and returns a sentence about the fault for an operator.
     hindered : callable
-        Why the record cannot judge this cause; empty if it can.
+        Returns why the record cannot show this cause; empty if it can.
     confusers : tuple of str
-        Names of causes that look alike.
+        Names of causes with similar effects.
     experiment : str
-        What would tell them apart.
+        Experiment that would distinguish them.
     """
 
     name: str
@@ -260,20 +260,20 @@ class Cause:
     confusers: tuple[str, ...]
     experiment: str
     hindered: Callable[[Grids], str] = field(default=lambda grids: '')
-    slow: bool = False  # a slow wander of the power could be mistaken for it
-    # Infers what is hidden (``extra``) from the sub-blocks allowed, for a given size.
+    slow: bool = False  # can be confused with a slow disturbance of the power
+    # Estimates the hidden state (``extra``) from the allowed sub-blocks, for a given size.
     infer: Callable[[Any, Active, BoolArray], Values] | None = None
-    of_model: bool = False  # an identification that is free to choose may find it too
-    order: int = 0  # among causes of one stage: from the oil to the plug
-    # How many paths the noise may make of it, and what acts in one of them; see `draws`.
+    of_model: bool = False  # a free identification may include it in the model
+    order: int = 0  # order among causes of one stage: from the actuator to the plug
+    # Number of simulated noise paths, and the ``act`` of a single one; see `fitting.beliefs`.
     draws: int = 0
     draw: Callable[[int], Callable[..., Any]] | None = None
-    # A simpler cause it becomes at some values, and those values near given ones.
+    # A simpler cause that is a special case, and such special values near given ones.
     contains: str = ''
     simpler: Callable[[Values], list[Values]] | None = None
-    # Families that cannot be judged beside it, since what it leaves open looks like them.
+    # Families that cannot be judged together with it: its remaining error looks like them.
     conceals: tuple[str, ...] = ()
-    # What it follows, if that is a column beside the signals.
+    # The column that the power follows, if any.
     covariate: Covariate | None = None
 
     def on(self, form: StaticForm) -> Cause:
@@ -289,7 +289,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Active:
-    """A cause with values: a part of an extended model."""
+    """A cause with parameter values, as part of an extended model."""
 
     cause: Cause
     values: Values
@@ -297,12 +297,12 @@ class Active:
 
     @property
     def name(self) -> str:
-        """Return the catalogue's word."""
+        """Return the name in the catalogue."""
         return self.cause.name
 
     @property
     def size(self) -> int:
-        """Return how many numbers were chosen from the data; every switch is one."""
+        """Return the number of values determined from the data; each switching time counts."""
         return len(self.values) + len(self.extra)
 
     def named(self) -> dict[str, float]:
@@ -311,7 +311,7 @@ class Active:
 
     @property
     def beyond(self) -> str:
-        """Return which value had to go to the end of what a plant can have; empty if none."""
+        """Return a sentence about a value near its upper bound; empty if there is none."""
         for unknown, value in zip(self.cause.unknowns, self.values, strict=True):
             if value >= _END * unknown.high > 0.0:
                 return (
@@ -320,14 +320,14 @@ class Active:
         return ''
 
     def sentence(self, start_ns: int, estimates: Mapping[str, Estimate] | None = None) -> str:
-        """Return what is wrong, for an operator.
+        """Return a sentence about the fault for an operator.
 
         Parameters
         ----------
         start_ns : int
             Time of the first row, ns since 1970 UTC.
         estimates : mapping, optional
-            The values with their intervals, by name; without them none are told.
+            The values with their intervals, by name; without them no intervals are reported.
         """
         values, onset = self.named(), ''
         for u in self.cause.unknowns:

@@ -1,19 +1,19 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Take the causes of an extended model out of rows as they come.
+"""Remove the causes of an extended model from a stream of rows.
 
-What the pipeline then sees is a plant without the causes:
+The pipeline then receives the signals of a plant without the causes:
 
-- a cause of the opening or of the input u goes into the opening: V' f for what passes the
-  plug at V, so that u = V' f p^m is what acts on the curve;
-- a cause of the flow, of the gain, of the dynamics or of the power shown is taken out of the
-  power by the difference of two simulations, y' = y - (y_extended - y_plain), both run on that u.
-  The difference hangs on inputs alone, so noise of y is neither amplified nor fed back;
-- of a clock that is late the power is delayed to the inputs it belongs to: a row's residual is
-  then that of power stamped so much earlier.
+- a cause of the opening or of the input u is removed from the opening: V' f, where V' is the
+  plug position for the measured V, so that u = V' f p^m is the input of the curve;
+- a cause of the flow, gain, dynamics or measured power is removed from the power by the
+  difference of two simulations, y' = y - (y_extended - y_plain), both run on that u. The
+  difference depends on inputs only, so noise of y is neither amplified nor fed back;
+- for a late clock the power is delayed to match its inputs: the residual of a row is then
+  that of a power with an earlier time stamp.
 
-Hence y' - plain(u') = y - extended(inputs), whatever curve is put for both sides' F up to the
-product of its change and the size of the cause.
+Hence y' - plain(u') = y - extended(inputs). If both sides use another curve F, this holds up to
+the product of the change of F and the size of the cause.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.state import Memory, State, put_back
 
-# What a cause with a memory does to rows as they come.
+# Streaming versions of the causes with memory.
 #
-# Causes that need only the row at hand are asked by their own ``act``. Those here carry a state:
-# the same formulas as in the catalogue, with their own small classes.
+# Causes without memory are computed with their own ``act``. The classes here keep a state and
+# use the same formulas as the catalogue.
 
-_DRAWS = 10  # as many as the catalogue's stiction averages over
+_DRAWS = 10  # the same number of noise realisations as in the catalogue
 _SEED = 20_240
 _LONGEST_DELAY_S = 660.0
 
@@ -57,15 +57,15 @@ class Valve(Protocol):
     """A cause between the position sensor and the plug."""
 
     def feed(self, v: FloatArray, time_ns: IntArray) -> FloatArray:
-        """Return the opening in % behind it, shape (n,); NaN is passed."""
+        """Return the opening in % downstream of the cause, shape (n,); NaN stays NaN."""
         ...
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state."""
         ...
 
     def restore(self, saved: State) -> None:
-        """Go on from a state."""
+        """Continue from a saved state."""
         ...
 
 
@@ -77,13 +77,13 @@ class Stop(Memory):
         self._active = active
 
     def feed(self, v: FloatArray, time_ns: IntArray) -> FloatArray:
-        """Return what the cause itself says."""
+        """Return the opening from the ``act`` of the cause."""
         del time_ns
         return np.asarray(self._active.cause.act(v, self._active.values, None), dtype=np.float64)
 
 
 class Slack(Memory):
-    """A backlash: the plug stays where it is until a flank reaches it."""
+    """A backlash: the plug stays until one end of the gap reaches it."""
 
     REMEMBERED = ('_state',)
 
@@ -93,7 +93,7 @@ class Slack(Memory):
         self._state = np.full(1, np.nan)
 
     def feed(self, v: FloatArray, time_ns: IntArray) -> FloatArray:
-        """Follow, keeping the place over gaps."""
+        """Follow the position; the plug position is kept over gaps."""
         del time_ns
         out = np.empty(len(v))
         kernels.play_block(v, self._half, self._state, out)
@@ -101,7 +101,7 @@ class Slack(Memory):
 
 
 class SlowServo(Memory):
-    """A rate limit, by the time between rows."""
+    """A rate limit, with the time between rows."""
 
     REMEMBERED = ('_state', '_last_ns')
 
@@ -111,20 +111,20 @@ class SlowServo(Memory):
         self._state, self._last_ns = np.full(1, np.nan), np.zeros(1, dtype=np.int64)
 
     def feed(self, v: FloatArray, time_ns: IntArray) -> FloatArray:
-        """Follow; what was missed in a gap is made up for."""
+        """Follow the position; the plug continues to move during a gap."""
         out = np.empty(len(v))
         kernels.rate_limit_block(v, time_ns, self._rate, self._state, self._last_ns, out)
         return out
 
 
 class Sticking:
-    """A stiction, averaged over draws of the sensor's noise.
+    """A stiction, averaged over realisations of the sensor noise.
 
-    The catalogue takes the noise from the record; here it is the one the model was made
-    with. The draws come from a generator of their own, row by row, so that blocks do
-    not matter and a replay repeats them. They all count alike: the diagnosis weighs them
-    by the power measured (`draws`), which explains somewhat more, but would let the
-    measured power into its own prediction.
+    The catalogue takes the noise from the record; here it is the noise stored with the model.
+    The realisations come from a separate random generator, row by row, so that the block size has
+    no effect and a replay gives the same result. All have equal weight: the diagnosis weights
+    them by the measured power (`fitting.beliefs`), which explains somewhat more, but here the
+    measured power would enter its own prediction.
     """
 
     def __init__(self, active: Active, reference: Reference) -> None:
@@ -134,7 +134,7 @@ class Sticking:
         self._chance = np.random.default_rng(_SEED)
 
     def feed(self, v: FloatArray, time_ns: IntArray) -> FloatArray:
-        """Return the mean place of the plug."""
+        """Return the mean position of the plug."""
         del time_ns
         out = np.empty(len(v))
         noise = self._noise * self._chance.standard_normal((len(v), _DRAWS))
@@ -142,17 +142,17 @@ class Sticking:
         return out
 
     def snapshot(self) -> State:
-        """Return what is remembered, the generator's place among it."""
+        """Return the state, including that of the random generator."""
         return {'places': self._state.copy(), 'chance': self._chance.bit_generator.state}
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         put_back({'places': self._state}, saved)
         self._chance.bit_generator.state = saved['chance']
 
 
 class Response(Memory):
-    """Regional dynamics, run on a flow as it comes."""
+    """Regional dynamics applied to a stream of flow values."""
 
     REMEMBERED = ('_place', '_answer', '_past')
 
@@ -176,7 +176,7 @@ class Response(Memory):
 
 
 class Reheater(Response):
-    """A reheater behind part of the turbine: a share of the power is late by one lag."""
+    """A reheater before part of the turbine: a fraction of the power has one more lag."""
 
     def __init__(self, active: Active, step_s: float) -> None:
         share, time_s = active.values
@@ -184,12 +184,12 @@ class Reheater(Response):
         self._share = share
 
     def feed(self, x: FloatArray, begin: ByteArray) -> FloatArray:
-        """Return the power shown."""
+        """Return the measured power."""
         return np.asarray(self._share * x + (1.0 - self._share) * super().feed(x, begin))
 
 
 class LateClock(Memory):
-    """A series as it was some time ago."""
+    """A series delayed by a constant time."""
 
     REMEMBERED = ('_place', '_past')
 
@@ -200,7 +200,7 @@ class LateClock(Memory):
         self._place, self._past = np.zeros(2, dtype=np.int64), np.zeros(self._whole + 2)
 
     def feed(self, y: FloatArray, jumps: ByteArray) -> FloatArray:
-        """Return the series delayed; NaN where what it was is not known."""
+        """Return the delayed series; NaN where the earlier value is unknown."""
         out = np.empty(len(y))
         kernels.delay(y, jumps, self._whole, self._part, self._place, self._past, out)
         return out
@@ -217,12 +217,12 @@ _SHOWN = {REHEATER, CLOCK, 'output_offset_drift'}
 
 
 def valves(chain: tuple[Active, ...], reference: Reference) -> list[Valve]:
-    """Return what causes of the opening do, from the oil to the plug."""
+    """Return the streaming versions of the causes of the opening, from actuator to plug."""
     return [_VALVES[a.name](a, reference) for a in sorted(chain, key=lambda a: a.cause.order)]
 
 
 def check_streams(active: tuple[Active, ...]) -> None:
-    """Refuse a cause whose memory is not known here.
+    """Raise if a cause has no streaming version here.
 
     Raises
     ------
@@ -239,17 +239,17 @@ def check_streams(active: tuple[Active, ...]) -> None:
             raise DataError(f"The cause '{a.name}' cannot be taken out of rows as they come yet.")
 
 
-# Functions like exp take several numbers at once; blocks of whole such handfuls round alike.
+# SIMD code of functions like exp needs full vectors; padded blocks give identical rounding.
 _HANDFUL = 16
 
 
 def corrector_of(given: ExtendedModel, step_s: float) -> Corrector:
-    """Return what takes all causes of a model out of rows ``step_s`` apart.
+    """Return the object that removes all causes of a model from rows ``step_s`` apart.
 
     Raises
     ------
     DataError
-        A cause cannot be taken out of rows as they come.
+        A cause has no streaming version.
     """
     own = ModelCorrector(given, step_s)
     if given.on_top_of is None:
@@ -258,7 +258,7 @@ def corrector_of(given: ExtendedModel, step_s: float) -> Corrector:
 
 
 class ChainCorrector:
-    """Two correctors, one after the other."""
+    """Two correctors in sequence."""
 
     def __init__(self, first: Corrector, second: Corrector) -> None:
         self._first, self._second = first, second
@@ -269,7 +269,7 @@ class ChainCorrector:
         return self._first.held + self._second.held
 
     def correct(self, table: SampleTable) -> SampleTable:
-        """Correct by both."""
+        """Apply both corrections."""
         return self._second.correct(self._first.correct(table))
 
     def restart(self) -> None:
@@ -278,17 +278,17 @@ class ChainCorrector:
         self._second.restart()
 
     def snapshot(self) -> State:
-        """Return what both remember."""
+        """Return the state of both."""
         return {'first': self._first.snapshot(), 'second': self._second.snapshot()}
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         self._first.restore(saved['first'])
         self._second.restore(saved['second'])
 
 
 class ModelCorrector(Memory):
-    """Take the causes of one extended model out of rows.
+    """Remove the causes of one extended model from rows.
 
     Parameters
     ----------
@@ -298,17 +298,17 @@ class ModelCorrector(Memory):
 
     Notes
     -----
-    Beyond the record that the model comes from a drift goes on in its straight line, a step
-    stays, a daily swing repeats, and ``intervals`` keep the state of their last switch, since
-    later ones are not known. Before the record a drift is continued backwards.
+    Outside the record of the model, a drift continues in a straight line, a step stays, a daily
+    cycle repeats, and ``intervals`` keep the state of their last switch, because later ones are
+    unknown. Before the record a drift is extrapolated backwards.
 
-    After a gap the responses begin in equilibrium, as the simulation does; the plug keeps
-    its place. The power of a late clock is not known for as long as the clock is late.
+    After a gap the responses begin in equilibrium, as in the simulation; the plug keeps its
+    position. The power of a late clock is unknown for the duration of the delay.
 
     Raises
     ------
     DataError
-        A cause cannot be taken out of rows as they come.
+        A cause has no streaming version.
     """
 
     REMEMBERED = ('_temperature', '_follows')
@@ -348,7 +348,7 @@ class ModelCorrector(Memory):
         self._follows = np.array([np.iinfo(np.int64).min // 2, kernels.NO_DATA], dtype=np.int64)
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state."""
         return {
             **super().snapshot(),
             'parts': [part.snapshot() for part in self._parts()],
@@ -356,7 +356,7 @@ class ModelCorrector(Memory):
         }
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         if saved['causes'] != self._causes():
             raise DataError('The saved state was made with another model_file.')
         super().restore(saved)
@@ -364,7 +364,7 @@ class ModelCorrector(Memory):
             part.restore(given)
 
     def _causes(self) -> list[Any]:
-        """Return what is taken out: another model of the same causes is another one."""
+        """Return an identifier of the removed causes and values; a state must match it."""
         base = self._model.base
         curve = [base.knots.tolist(), base.left.tolist(), base.right.tolist()]
         return [curve, *([a.name, list(a.values), list(a.extra)] for a in self._model.active)]
@@ -399,7 +399,7 @@ class ModelCorrector(Memory):
         return _with(table, opening * factor[:n], power)
 
     def _scene(self, table: SampleTable, opening: FloatArray) -> Grids:
-        """Return the rows as causes without a memory want them, a whole number of handfuls."""
+        """Return the rows as grids for causes without memory, padded to full vectors."""
         pressure = np.ascontiguousarray(table.column(Signal.MAIN_STEAM_PRESSURE))
         u, scale = self._given.form.of_rows(opening, pressure)
         scale = np.ones(len(u)) if scale is None else scale
@@ -430,7 +430,7 @@ class ModelCorrector(Memory):
     def _difference(
         self, grids: Grids, u: FloatArray, scale: FloatArray, begin: ByteArray
     ) -> FloatArray:
-        """Return by how much the extended model shows more than the plain one, MW."""
+        """Return the power of the extended model minus that of the plain one, MW."""
         n = len(begin)
         plain, x = _flow(self._model, u, grids.scale), _flow(self._model, u, scale)
         for a in self._flows:
@@ -461,7 +461,7 @@ def _flow(model: Extended, u: FloatArray, scale: FloatArray) -> FloatArray:
 
 
 def _padded(x: FloatArray) -> FloatArray:
-    """Return a copy whose last value is repeated up to a whole number of handfuls."""
+    """Return a copy padded with its last value to full vectors."""
     return np.concatenate([x, np.full(-len(x) % _HANDFUL, x[-1])])
 
 

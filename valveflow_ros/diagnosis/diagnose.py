@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From a record and a model to a diagnosis."""
+"""Create a diagnosis from a record and a model."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
 
-# The sealed blocks, opened once: what each cause is worth there, and whether that stands.
+# The sealed blocks are a test set, used only once: the gain of each cause on them.
 #
-# A name that the open blocks suggest stands only if blocks nothing was fitted to confirm it at
-# the 5 % level, the number of causes tried taken into account.
+# A cause found on the open blocks is named only if the sealed blocks, to which nothing was
+# fitted, confirm it at the 5 % level, corrected for the number of causes tried.
 
 
 def confirm(found: Found) -> None:
-    """Take back names that the sealed blocks do not confirm, the least likely first."""
+    """Remove causes that the sealed blocks do not confirm, the least likely first."""
     while found.model.active:
         gains = gains_of(found, steps(found))
         worst = max(range(len(gains)), key=lambda k: gains[k].p_value)
@@ -86,7 +86,7 @@ def confirm(found: Found) -> None:
 
 
 def steps(found: Found) -> list[Extended]:
-    """Return the models with one cause more each, fitted to the open blocks."""
+    """Return the models with one more cause each, fitted to the open blocks."""
     models = [found.plain]
     for k in range(1, len(found.model.active)):
         part = replace(found.model, active=found.model.active[:k])
@@ -95,18 +95,18 @@ def steps(found: Found) -> list[Extended]:
 
 
 def gains_of(found: Found, models: list[Extended]) -> list[Gain]:
-    """Return what each cause brings on the sealed blocks, over those found before it."""
+    """Return the gain of each cause on the sealed blocks over the model with the earlier ones."""
     return [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
 
 
-# Causes that are found without the model of the unit: in the actuator and in the record.
+# Causes found without the model of the unit: in the actuator and in the record.
 
 _BETWEEN = 'Between the commanded and the measured opening: '
 _SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening is taken up.'
 
 
 def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
-    """Return the fault between command and position sensor, its size in MW of power."""
+    """Return the fault between command and position sensor, with its size in MW of power."""
     grids = found.task.grids
     fault = actuator.judge(grids)
     if fault is None or fault.name in found.model.names:
@@ -138,7 +138,7 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
 def record_causes(
     raw: Grids | None, found: Found, wrong: tuple[Fault, ...]
 ) -> tuple[NamedCause, ...]:
-    """Return faults of the record as causes; before: with the rows that were not believed."""
+    """Return faults of the record as causes; "before" is the RMSE with the invalid rows."""
     if raw is None:
         return ()
     before = rmse(replace(found.task, grids=raw), found.model, raw.sealed_rows)
@@ -162,7 +162,7 @@ def _fault_parameters(fault: Fault) -> dict[str, Estimate]:
 
 
 def notes(grids: Grids) -> tuple[str, ...]:
-    """Say what could not be judged for want of a command, and what the recording may feign."""
+    """Return what cannot be judged without a command, and what the recording may imitate."""
     said = []
     if why := actuator.hindered(grids):
         said.append(f'Faults between command and position sensor cannot be judged: {why}.')
@@ -178,8 +178,8 @@ def notes(grids: Grids) -> tuple[str, ...]:
 
 _LEAST_SPREAD = 0.01
 _FAR_MORE = 8.0
-_OWN_MISFIT = 0.004  # of the power's range
-# Causes that are a level of the power in time, and the shapes that are theirs, by their families.
+_OWN_MISFIT = 0.004  # of the range of the power
+# Causes that change the level of the power in time, and equivalent shapes, by their families.
 _LEVELS = (
     'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
     'intervals',
@@ -188,12 +188,12 @@ _SHAPES = {
     ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
     ('drift', 'drift'): ('drift',), ('hidden',): ('there and back',),
 }  # fmt: skip
-# Log-likelihood by which another shape must be better than one name; than several, none.
+# Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
 _ANOTHER_SHAPE = 6.0
-_LEAST_SHAPE = 5.0  # the same over a wander of no shape
-_LAST_STEPS = 10  # knots go slowly beside a bump
+_LEAST_SHAPE = 5.0  # the same for a shape over a slow disturbance without a shape
+_LAST_STEPS = 10  # breakpoints converge slowly near a bump
 _FULL_LOAD = 0.9  # quantile of the power
-_ACTS = 0.05  # share of the largest change below which there is none
+_ACTS = 0.05  # fraction of the largest change below which there is no effect
 
 
 def _quiet(_share: float, _what: str) -> None:
@@ -202,7 +202,7 @@ def _quiet(_share: float, _what: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What is diagnosed.
+    """The record to be diagnosed.
 
     Attributes
     ----------
@@ -212,12 +212,12 @@ class Record:
     form : StaticForm
         Of the model.
     settle_s : float
-        Time after a gap until the model can be believed.
+        Time after a gap until the model is valid.
     spans_ns : int64 (k, 2)
         First and last time of special segments.
     measured : SampleTable, optional
-        The rows as measured, where causes were taken out of ``table``: faults of the
-        signals are looked for in these (a plug that a slack lets rest is no dead transmitter).
+        The rows as measured, if causes were removed from ``table``. Signal faults are searched for
+        in these (a constant opening due to backlash is not a transmitter fault).
     compression : Compression, optional
         How the record was compressed, if it was.
     covariates : tuple of CovariateRows
@@ -234,23 +234,23 @@ class Record:
     covariates: tuple[CovariateRows, ...] = ()
 
     def faults(self) -> tuple[BoolArray, tuple[Fault, ...]]:
-        """Return which values are not to be believed, shape (n, 5), and what is wrong."""
+        """Return which values are invalid, shape (n, 5), and the faults."""
         table = self.table if self.measured is None else self.measured
         return faults(table, self.step_s, self.compression is not None)
 
     def grids(self, bad: BoolArray, rough: bool = False) -> Grids:
-        """Return the record on the grids of a diagnosis; ``bad`` (n, 5) is not believed."""
+        """Return the record on the grids of a diagnosis; values marked in ``bad`` are left out."""
         return make_grids(*self.about, bad, rough, self.compression, self.covariates)
 
     @property
     def about(self) -> tuple[SampleTable, float, StaticForm, float]:
-        """Return what `make_grids` wants first."""
+        """Return the first arguments of `make_grids`."""
         return self.table, self.step_s, self.form, self.settle_s
 
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """What the final residual still holds."""
+    """What the final residual still contains."""
 
     wander: Wander
     structure: Structure
@@ -262,7 +262,7 @@ class _Rest:
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Return the slow wander of the power, a drift if it is one."""
+        """Return the slow disturbance of the power; None if there is none."""
         slow, course = self.drift, self.course
         if course is not None:
             scale_s = slow.time_scale_s if slow.there else self.wander.time_scale_s
@@ -278,7 +278,7 @@ class _Rest:
 def diagnose(
     record: Record, model: RegionalModel, given: bool = False, progress: Progress = _quiet
 ) -> Diagnosis:
-    """Say what the simulation gets wrong, name the cause, extend the model, measure the gain.
+    """Find the errors of the simulation, name the cause, extend the model, measure the gain.
 
     Parameters
     ----------
@@ -286,8 +286,8 @@ def diagnose(
     model : RegionalModel
         Curve and dynamics: those identified from this record, or those of an earlier one.
     given : bool
-        The model comes from elsewhere: its dynamics and number of pieces are taken as they
-        are, and what differs from them is a finding. Otherwise they follow the record.
+        The model comes from elsewhere: its dynamics and number of pieces are kept, and any
+        difference from them is a finding. Otherwise they are fitted to the record.
 
     Raises
     ------
@@ -322,16 +322,16 @@ def diagnose_form(
     record: Record, model: RegionalModel, asked: Record, found_model: RegionalModel,
     progress: Progress = _quiet,
 ) -> Diagnosis:  # fmt: skip
-    """Diagnose a record whose static power has another form than the model given.
+    """Diagnose a record whose static power has another form than the given model.
 
-    The form is the first cause; the others are looked for in the form that the data ask for.
+    The form is the first cause; the others are searched for in the form selected by the data.
 
     Parameters
     ----------
     record, model
-        The form and the model given.
+        The given form and model.
     asked, found_model
-        The same rows in the form that the data ask for, and a model of it found in them.
+        The same rows in the form selected by the data, and a model of it found in them.
 
     Raises
     ------
@@ -366,7 +366,7 @@ _AT_OPENINGS = ' The breakpoints of this valve are at fixed openings.'
 
 
 def _moves(grids: Grids) -> None:
-    """Refuse a record in which nothing happens."""
+    """Raise if the valve hardly moves."""
     low, high = np.quantile(grids.u[grids.usable > 0], (0.01, 0.99))
     if high - low < _LEAST_SPREAD * abs(high):
         raise DataError(
@@ -376,12 +376,12 @@ def _moves(grids: Grids) -> None:
 
 
 def _wandering(grids: Grids, screening: Screening, slow: Wander) -> FloatArray | None:
-    """Return the disturbance in MW of every mean, None if there is none."""
+    """Return the slow disturbance in MW for every mean; None if there is none."""
     return slow.level[grids.sub] * screening.here if slow.there else None
 
 
 def _look_again(found: Found) -> _Rest:
-    """Look at what the model with all causes leaves."""
+    """Test the residual of the model with all causes."""
     screening = Screening(found.task, found.model)
     slow = wander(screening)
     left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
@@ -395,12 +395,12 @@ def _look_again(found: Found) -> _Rest:
 def _course(found: Found) -> Course | None:
     """Return the shape of a change in time that the causes do not explain; None if there is none.
 
-    Names of causes in time are taken back where another shape, or a wander of none, is better than
-    what they make together: a dated step and a drift can stand for nearly any slow change.
+    Causes in time are removed if another shape, or a slow disturbance without a shape, fits better
+    than all of them together: a step plus a drift can imitate nearly any slow change.
     """
     names = [name for name in found.model.names if name in _LEVELS]
     if names == ['curve_step']:
-        names = []  # alone it is a matter of the load, too
+        names = []  # a single curve_step also depends on the load
     tried = courses(found.task, found.model, names)
     if not tried:
         return None
@@ -409,7 +409,7 @@ def _course(found: Found) -> Course | None:
         families = tuple(sorted(catalogue()[name].family for name in names))
         mine = [tried[shape] for shape in (NAMED_SHAPE, *_SHAPES.get(families, ()))]
         if 'intervals' in names and best.name == NO_SHAPE:
-            return None  # each switch costs a number, which a wander has for nothing
+            return None  # every switching time costs a parameter; a disturbance needs none for it
         least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
         if best.score - max(c.score for c in mine) <= least:
             return None
@@ -439,7 +439,7 @@ _OF_SHAPE = {
 
 
 def course_words(course: Course, start_ns: int) -> str:
-    """Say how the power changes in time, in MW and UTC."""
+    """Return words for how the power changes in time, in MW and UTC."""
     mw = [f'{size:+.{1 if abs(size) >= 1.0 else 2}f} MW' for size in course.mw]
     at = [told(start_ns, s, _COURSE_STEP_S) for s in course.at_s]
     if course.spread_s:
@@ -471,21 +471,21 @@ _DAYS_FROM_H = 48.0
 
 
 def _dated(found: Found) -> Extended:
-    """Return the model with its onsets as all blocks tell them.
+    """Return the model with its onsets fitted to all blocks.
 
-    A change that came in a sealed block, or beside one, is put at the wrong end of it by the
-    others; the hours between there and the truth would look like a misfit, or a slow
-    disturbance. So of the sealed blocks nothing is used but the moment of a change.
+    The open blocks alone would place a change inside a sealed block at the wrong end of it. The
+    hours between that and the true time would look like a misfit or a slow disturbance. Only the
+    time of a change is taken from the sealed blocks.
     """
     every = replace(found.task, rows=found.task.grids.whole)
     return search_onsets(every, found.model)
 
 
 def _own_misfit(found: Found, left: Structure) -> str:
-    """Say what the form of the model leaves, where that is too little to be something else.
+    """Return a note on a structure error of the model that is too small to be a fault; else ''.
 
-    A smooth area curve is no straight pieces and a turbine no single lag, and from means over a
-    minute the lag is not known. Little as it is, that shows in records of days. It is no fault.
+    A real area curve is smooth, a turbine has more than one lag, and means over a minute do not
+    show the lag. The resulting small error is visible in records of days. It is not a fault.
     """
     size = float(np.sqrt(left.explained_mw2)) if left.there else 0.0
     if not 0.0 < size < _own_size(found.task):
@@ -497,9 +497,9 @@ def _own_misfit(found: Found, left: Structure) -> str:
 
 
 def _withdraw_small(found: Found) -> None:
-    """Take back names that explain no more than a model of another record may be off.
+    """Remove causes that explain no more than the usual error of a model of another record.
 
-    Only beside a given model, where its form or the recording is known to leave so much.
+    Only with a given model whose form or recording is known to leave such an error.
     """
     least = _own_size(found.task)
     if not found.task.fixed_dynamics or not least:
@@ -516,7 +516,7 @@ def _withdraw_small(found: Found) -> None:
 
 
 def _own_size(task: Task) -> float:
-    """Return what the form of the model or the recording may leave, MW; 0 where neither does."""
+    """Return the expected error of the model form or the recording, MW; 0 if there is none."""
     if not (task.grids.form.scaled or task.grids.blur.words):
         return 0.0
     power = task.grids.power[task.grids.scored]
@@ -524,9 +524,9 @@ def _own_size(task: Task) -> float:
 
 
 def _withdraw(found: Found, rest: _Rest) -> _Rest:
-    """Take back names of causes in time where the power wanders slowly all the time.
+    """Remove causes in time if the power has a slow disturbance throughout the record.
 
-    One that explains far more than the wander it would have to be part of stays.
+    A cause stays if it explains far more than that disturbance.
     """
     slow = rest.disturbance
     if slow is None:
@@ -539,12 +539,12 @@ def _withdraw(found: Found, rest: _Rest) -> _Rest:
                 NO_SHAPE if rest.course is None else rest.course.name
             ]
     found.model, _ = improve(found.task, found.model, 3)
-    # What these names had taken up belongs to the drift.
+    # The effect that these causes explained now belongs to the drift.
     return replace(rest, drift=drift(found.task, found.model))
 
 
 def _explained(found: Found, name: str) -> float:
-    """Return by how much a cause lowers the mean square of the residual, MW^2."""
+    """Return the reduction of the mean square of the residual by a cause, MW^2."""
     rows = found.task.rows
     without, _ = improve(found.task, found.model.without(name), 3)
     left, more = (found.task.residual(m)[rows] for m in (found.model, without))
@@ -552,7 +552,7 @@ def _explained(found: Found, name: str) -> float:
 
 
 def _final(found: Found) -> tuple[Task, Extended]:
-    """Fit the extended model to all blocks, the sealed ones too."""
+    """Fit the extended model to all blocks, including the sealed ones."""
     task = replace(found.task, rows=found.task.grids.whole)
     model, cost = improve(task, found.model, _LAST_STEPS)
     model, cost = search_levels(task, model, cost)
@@ -561,10 +561,10 @@ def _final(found: Found) -> tuple[Task, Extended]:
 
 
 def _meaning(task: Task, model: Extended, cause: Active) -> str:
-    """Say what a cause is worth at full load, against the model without it.
+    """Return a sentence with the effect of a cause at full load, relative to the model without it.
 
-    Of a step it is the difference between after and before, of a drift that between the end and
-    the beginning, of intervals that between in effect and not.
+    For a step this is the value after minus before, for a drift the end minus the beginning, for
+    intervals the difference between the two states.
     """
     grids, whole = task.grids, task.grids.whole
     without = answer(grids, model.without(cause.name))
@@ -590,7 +590,7 @@ def _meaning(task: Task, model: Extended, cause: Active) -> str:
 def _worth(
     cause: Active, moved: FloatArray, day: FloatArray, onset: float | None, days: float
 ) -> tuple[float, float]:
-    """Return the signed MW of a cause, 0 where it goes to both sides, and how far it goes."""
+    """Return the signed MW of a cause (0 if it has both signs) and its largest size."""
     reach = float(np.quantile(np.abs(moved), 0.95))
     if onset is not None:
         after = day >= onset
@@ -664,7 +664,7 @@ def _conclude(
 
 
 def _other_bend(task: Task, final: Extended, found: Found) -> dict[str, Estimate]:
-    """Return the bend of the other sign on all blocks; empty where there is none to tell of."""
+    """Return the bend of opposite sign, fitted to all blocks; empty if there is none to report."""
     other = found.other_bend
     if other is None or 'curve_shape' not in final.names:
         return {}
@@ -675,7 +675,7 @@ def _other_bend(task: Task, final: Extended, found: Found) -> dict[str, Estimate
 
 
 def _either(one: dict[str, Estimate], other: dict[str, Estimate]) -> dict[str, Estimate]:
-    """Return the values of the one with intervals that hold those of both; NaN stays NaN."""
+    """Return the values of the first with intervals that cover both; NaN stays NaN."""
     return {
         name: replace(
             e, low=float(np.minimum(e.low, other[name].low)),
@@ -686,9 +686,9 @@ def _either(one: dict[str, Estimate], other: dict[str, Estimate]) -> dict[str, E
 
 
 def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
-    """Return the verdict, and whether names must be taken back.
+    """Return the verdict, and whether the names must be removed.
 
-    Structure that weighs more than what the causes explain means that they are at best near it.
+    If the remaining structure exceeds what the causes explain, they are only approximate.
     """
     left = 0.0
     if rest.structure.there:
@@ -715,7 +715,7 @@ def _unexplained(rest: _Rest) -> tuple[str, ...]:
     course, structure = rest.course, rest.structure
     names = structure.variables if structure.there else ()
     if course is not None:
-        # A large change in time shows in what goes along with it by chance, too.
+        # A large change in time also shows in variables that correlate with time by chance.
         small = course.rms_mw**2 < structure.explained_mw2
         names = (*names, _THE_TIME) if small else (_THE_TIME,)
     return (*names, rest.period.words) if rest.period.there else names
@@ -726,7 +726,7 @@ def _experiments(causes: tuple[NamedCause, ...]) -> tuple[str, ...]:
 
 
 def _sentence(d: Diagnosis) -> str:
-    """Return the verdict as one sentence an operator understands."""
+    """Return the verdict as sentences for an operator."""
     wander = '' if d.disturbance is None else f' {d.disturbance.sentence}'
     if d.verdict == NAMED:
         drifts = d.disturbance is not None and d.disturbance.drift_mw is not None

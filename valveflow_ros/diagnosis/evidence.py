@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How much the data speak for a cause, its gain on sealed blocks, and how sure its sizes are."""
+"""The evidence for a cause, its gain on sealed (test) blocks, and intervals of its sizes."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from valveflow_ros.diagnosis.screening import Screening, nuisance
 from valveflow_ros.fit.whitening import fit_ar, inflation
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
-# States that are not measured: inferred again where a model is to be judged or used.
+# Hidden states: estimated again when a model is judged or used.
 
 
 def inferred(task: Task, model: Extended, allowed: BoolArray) -> Extended:
-    """Return the model with hidden states as the allowed sub-blocks show them.
+    """Return the model with its hidden states estimated from the allowed sub-blocks.
 
     Parameters
     ----------
     task : Task
-        Its rows are those that may be looked at, together with ``allowed``.
+        Its rows may be used, together with ``allowed``.
     allowed : bool (subs,)
     """
     for a in model.active:
@@ -45,17 +45,17 @@ def inferred(task: Task, model: Extended, allowed: BoolArray) -> Extended:
 
 
 def fair_residual(task: Task, model: Extended) -> FloatArray:
-    """Return the residual in MW, shape (m,), with hidden states inferred from other sub-blocks.
+    """Return the residual in MW, shape (m,), with hidden states estimated from other sub-blocks.
 
-    In a sealed block a state cannot be known from outside. The even sub-blocks tell the
-    state of the odd ones and the other way round, so that no row is judged by a state it helped
-    to find. The size of the effect stays as fitted elsewhere.
+    The state inside a sealed block cannot be found from outside it. So the even sub-blocks give
+    the state of the odd ones and vice versa: no row is judged by a state estimated from it. The
+    size of the effect stays as fitted elsewhere.
     """
     return _crossed(replace(task, rows=task.grids.whole), model)
 
 
 def fair_open_residual(task: Task, model: Extended) -> FloatArray:
-    """Return the same with the states told by rows of the task alone."""
+    """Return the same residual with the states estimated from rows of the task only."""
     return _crossed(task, model)
 
 
@@ -69,7 +69,7 @@ def _crossed(task: Task, model: Extended) -> FloatArray:
 
 
 _LAGS = 3
-_RIDGE = 1e-4  # of a column's own square
+_RIDGE = 1e-4  # of the squared norm of a column
 _MEMORY_S = 1200.0
 LEAST_GAIN, LEAST_SIGN = 16.0, 1.0
 _WALD_LEVEL, _WALD_EACH = 10.0, 5.0
@@ -86,10 +86,10 @@ def _by_block(task: Task, table: FloatArray) -> tuple[FloatArray, np.ndarray]:
 
 
 def held_out(task: Task, model: Extended) -> FloatArray:
-    """Return the sum of squared innovations of each block under parameters fitted without it.
+    """Return the sum of squared innovations of each block, with parameters fitted without it.
 
-    Every fold's parameters are one Gauss-Newton step from the common optimum, using the
-    sums of the other folds. What hardly shows in them (a knee that lies in one block) stays.
+    The parameters of each fold are one Gauss-Newton step from the common optimum, with the sums of
+    the other folds. Parameters that these hardly determine (a breakpoint in one block) stay.
     """
     table = np.column_stack([nuisance(task, model), task.innovations(task.residual(model))])
     sums, blocks = _by_block(task, table)
@@ -118,18 +118,18 @@ def long_run_variance(scores: FloatArray, lags: int = _LAGS) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What speaks for a cause.
+    """The evidence for a cause.
 
     Attributes
     ----------
     gain : float
         Log-likelihood gained on held-out blocks.
     wald : float
-        Squared size of the effect over its robust variance.
+        Squared size of the effect divided by its robust variance.
     sign : float
-        Mean over standard error of the gains of single blocks.
+        t value of the gains of single blocks: mean divided by standard error.
     size : int
-        Numbers chosen from the data; each by itself makes some Wald out of nothing.
+        Number of values chosen from the data; each raises the Wald statistic by chance.
     """
 
     gain: float
@@ -139,16 +139,16 @@ class Evidence:
 
     @property
     def least_wald(self) -> float:
-        """Return what is asked of ``wald``."""
+        """Return the smallest sufficient ``wald``."""
         return _WALD_LEVEL + _WALD_EACH * self.size
 
     @property
     def enough(self) -> bool:
-        """Tell whether all three conditions are met."""
+        """Return True if all three conditions are met."""
         return self.gain > LEAST_GAIN and self.wald > self.least_wald and self.sign > LEAST_SIGN
 
     def reason(self) -> str:
-        """Say which conditions are not met."""
+        """Return which conditions are not met."""
         told = []
         if not self.gain > LEAST_GAIN:
             told.append(
@@ -168,22 +168,22 @@ class Evidence:
 
 
 def colour(task: Task, e: FloatArray) -> float:
-    """Return how many times the variance of a long mean of innovations exceeds that of white ones.
+    """Return the variance inflation of long means of innovations, relative to white noise.
 
-    Where the noise has a memory longer than the AR model holds, everything that varies slowly
-    looks more certain than it is; log-likelihoods are divided by this.
+    If the noise has a longer memory than the AR model, the significance of slow effects is
+    overestimated; log-likelihoods are divided by this factor.
     """
     rows = max(2, round(_MEMORY_S / task.grids.mean_s))
     return inflation(e, np.ones(len(e), dtype=np.uint8), min(rows, max(2, len(e) // 10)))
 
 
 def weigh(task: Task, without: Extended, model: Extended, size: int) -> Evidence:
-    """Compare two fitted models under one whitening.
+    """Compare two fitted models with the same whitening.
 
     Parameters
     ----------
     size : int
-        Numbers by which ``model`` exceeds ``without``.
+        Number of values that ``model`` has more than ``without``.
     """
     e = task.innovations(task.residual(model))
     variance = float(e @ e) / len(e) * colour(task, e)
@@ -195,7 +195,7 @@ def weigh(task: Task, without: Extended, model: Extended, size: int) -> Evidence
 
 
 def _hindsight(task: Task, model: Extended, e: FloatArray) -> float:
-    """Return what a hidden state explains only because it was found in the same rows."""
+    """Return the part explained by a hidden state only because it was fitted to the same rows."""
     if all(a.cause.infer is None for a in model.active):
         return 0.0
     fair = task.innovations(fair_open_residual(task, model))
@@ -203,7 +203,7 @@ def _hindsight(task: Task, model: Extended, e: FloatArray) -> float:
 
 
 def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> float:
-    """Return the squared robust t value of the difference of two models as a column."""
+    """Return the squared robust t value of the difference between two models."""
     grids = task.grids
     column = task.innovations(answer(grids, model) - answer(grids, without))
     n = nuisance(task, without)
@@ -215,7 +215,7 @@ def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> floa
     return float((column @ before) ** 2 / max(variance, 1e-300))
 
 
-# What a cause is worth on blocks of time that nothing was fitted to, opened once.
+# The gain of a cause on test blocks to which nothing was fitted; they are used once.
 
 LARGEST_P = 0.05
 _FLIPS = 100_000
@@ -226,7 +226,7 @@ _LEAST_SEGMENT_MEANS = 3
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """RMSE in MW on the sealed blocks without and with a cause, and the chance of such a gain."""
+    """RMSE in MW on the sealed blocks without and with a cause, and the p-value of the gain."""
 
     rmse_before: float
     rmse_after: float
@@ -240,7 +240,7 @@ class Gain:
 
 @dataclass(frozen=True, slots=True)
 class SegmentGain:
-    """One special segment inside sealed blocks: kind, times in ns, RMSE before and after."""
+    """One special segment inside sealed blocks: number, times in ns, RMSE before and after."""
 
     number: int
     start_ns: int
@@ -257,12 +257,12 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
 def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Gain:
     """Compare two models, both fitted to the open blocks, on the sealed ones.
 
-    Nothing is confirmed or refused by the time in which by the open blocks an onset may lie:
-    whether the change has come there, nobody could have told.
+    Times at which the onset may lie according to the open blocks do not count in the test: there
+    the models cannot know whether the change has happened.
     """
     rows = task.grids.sealed_rows
     told = rows & ~_while_unsure(task, after)
-    # Fewer sub-blocks than that could confirm nothing, whatever they say.
+    # With fewer sub-blocks the sign test could never be significant.
     enough = len(np.unique(task.grids.sub[told])) >= np.log2(max(tried, 1) / LARGEST_P)
     sealed = replace(task, rows=told if enough else rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
@@ -275,7 +275,7 @@ def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Ga
 
 
 def _while_unsure(task: Task, model: Extended) -> BoolArray:
-    """Return the means in whose time an onset may lie, shape (m,)."""
+    """Return the means at times where an onset may lie, shape (m,)."""
     day = task.grids.means(task.grids.time_s) / DAY_S
     out = np.zeros(len(day), dtype=bool)
     innovations = task.innovations(task.residual(model))
@@ -299,7 +299,7 @@ def _while_unsure(task: Task, model: Extended) -> BoolArray:
 def gain_of_form(task: Task, model: Extended, task_new: Task, new: Extended) -> Gain:
     """Compare models of two forms on the sealed blocks of the same rows.
 
-    Both residuals are whitened as the newer one asks for.
+    Both residuals are whitened with the AR model of the new one.
     """
     rows = task.grids.sealed_rows & task_new.grids.sealed_rows
     old_rest, new_rest = fair_residual(task, model), fair_residual(task_new, new)
@@ -313,11 +313,11 @@ def gain_of_form(task: Task, model: Extended, task_new: Task, new: Extended) -> 
 
 
 def sign_flip(scores: FloatArray) -> float:
-    """Return the chance that scores of either sign would sum to as much.
+    """Return the p-value of a sum of scores under random signs.
 
-    A score is the product, summed over a sub-block, of what the cause predicts and what was
-    left without it. What was fitted to other blocks cannot know the noise of these, so without
-    the cause either sign is as likely; sub-blocks are long against the noise's correlation.
+    A score is the sum over a sub-block of predicted effect times residual without the cause. A
+    model fitted to other blocks is independent of the noise here, so without the cause both signs
+    are equally likely. Sub-blocks are long compared with the correlation time of the noise.
     """
     rng = np.random.default_rng(_SEED)
     total, least = float(scores.sum()), 0
@@ -328,10 +328,9 @@ def sign_flip(scores: FloatArray) -> float:
 
 
 def noise_floor(task: Task, model: Extended, explained_mw2: float) -> float:
-    """Return the RMSE that noise alone would leave on the sealed blocks, estimated.
+    """Return an estimate of the RMSE on the sealed blocks due to noise alone.
 
-    What the finite record costs in the parameters, and structure that is still there, are
-    taken off.
+    The contributions of parameter errors and of remaining structure are subtracted.
     """
     rows = task.grids.sealed_rows
     columns = np.column_stack([base_tangents(task, model), cause_tangents(task, model)])
@@ -378,15 +377,15 @@ def by_segment(
     return tuple(out)
 
 
-# How sure the parameters of the causes are: 95 % intervals.
+# Uncertainty of the parameters of the causes: 95 % intervals.
 #
-# Smooth parameters get the sandwich of the joint Gauss-Newton matrix with scores summed over
-# blocks; dead bands and limits the profile of the likelihood, widened by the same ratio of
-# robust to plain variance. Where the likelihood jumps (an onset, a level, a band of sticking) its
-# ratio is no chi-square: the highest of two random walks that fall away from the true place is
-# below c with probability (1 - exp(-c / 2))^2, which is 0.95 at c = 7.35 (Siegmund, Adv. Appl.
-# Prob. 20, 1988, 645; Eo and Morley, Quant. Econ. 6, 2015, 463). What acts on the opening is
-# known no better than the opening is measured: two standard deviations of its noise are added.
+# Smooth parameters: sandwich estimator from the joint Gauss-Newton matrix and scores summed over
+# blocks. Dead bands and limits: profile likelihood, widened by the same ratio of robust to plain
+# variance. Where the likelihood has jumps (onset, level, stick band), the likelihood ratio is not
+# chi-square: the maximum of two random walks that fall away from the true value is below c with
+# probability (1 - exp(-c / 2))^2, which is 0.95 at c = 7.35 (Siegmund, Adv. Appl. Prob. 20, 1988,
+# 645; Eo and Morley, Quant. Econ. 6, 2015, 463). For causes of the opening, two standard
+# deviations of the noise of the opening are added.
 
 
 _Z95 = 1.959963984540054
@@ -399,7 +398,7 @@ _PROFILE_BLOCK_SUBS = 2
 
 
 class Certainty:
-    """The joint linearisation of a fitted model, from which all intervals come."""
+    """The joint linearisation of a fitted model; all intervals are computed from it."""
 
     def __init__(self, task: Task, model: Extended) -> None:
         model = free(model, causes_for(task.grids))
@@ -421,14 +420,14 @@ class Certainty:
         self._group = grids.sub[task.rows] // _PROFILE_BLOCK_SUBS
 
     def _widening(self, column: FloatArray) -> float:
-        """Return robust over plain variance of the coefficient of a column, at least 1."""
+        """Return robust divided by plain variance of the coefficient of a column, at least 1."""
         scores = np.bincount(self._group, column * self.e).astype(np.float64)
         scores = scores[np.bincount(self._group) > 0]
         plain = self.variance * float(column @ column)
         return max(1.0, long_run_variance(scores) / max(plain, 1e-300))
 
     def smooth(self) -> list[float]:
-        """Return a standard error for every parameter that Gauss-Newton moves."""
+        """Return a standard error for every parameter fitted by Gauss-Newton."""
         out = []
         for k in range(self.causes):
             influence = self.table @ self.inverse[:, k]
@@ -437,18 +436,18 @@ class Certainty:
         return out
 
     def profile(self, c: int, k: int, own: int | None) -> tuple[float, float]:
-        """Return where the profile of the likelihood falls by half the 95 % point of chi^2.
+        """Return the ends of the 95 % profile likelihood interval.
 
         Parameters
         ----------
         c, k : int
             Cause and parameter.
         own : int or None
-            Column of this parameter in the table, which must not follow.
+            Column of this parameter in the table, which is excluded from the other parameters.
         """
         mine = {own}
         if self.model.active[c].cause.unknowns[k].dated:
-            # The size at the place found, held against another place, would bring the cause back.
+            # A size fitted at another onset would replace the cause: exclude its column too.
             mine = set(self._columns_of(c))
         keep = [j for j in range(self.table.shape[1]) if j not in mine]
         others = self.table[:, keep]
@@ -482,7 +481,7 @@ class Certainty:
         return low, high
 
     def _columns_of(self, c: int) -> range:
-        """Return the columns of a cause in the table: its parameters that Gauss-Newton moves."""
+        """Return the columns of a cause in the table: its parameters fitted by Gauss-Newton."""
         moved = [sum(u.kind is not Kind.LINE for u in a.cause.unknowns) for a in self.model.active]
         return range(sum(moved[:c]), sum(moved[: c + 1]))
 
@@ -511,7 +510,7 @@ class Certainty:
 def _crossing(
     cost: Callable[[float], float], here: float, step: float, bound: float, most: float
 ) -> float:
-    """Return where the cost rises above ``most``, walking from ``here`` in steps that double."""
+    """Return where the cost exceeds ``most``, by doubling steps from ``here`` and bisection."""
     inside, outside = here, here
     stride = 0.05 * step
     for _ in range(_DOUBLINGS):
@@ -533,10 +532,10 @@ def _crossing(
 def _last_place(
     cost: Callable[[float], float], here: float, step: float, unknown: Unknown, most: float
 ) -> float:
-    """Return the last place in one direction whose cost is below ``most``.
+    """Return the last value in one direction whose cost is below ``most``.
 
-    The cost is ragged: the walk goes on over some places that are too dear, in strides that
-    grow where it gets far.
+    The cost is not smooth: the search continues over a few values of higher cost; its steps
+    grow with the distance.
     """
     stride, place, last, misses = 0.02 * step, here, here, 0
     for count in range(_PLACES):

@@ -31,7 +31,7 @@ _REMEMBERED = 24
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What causes make of the inputs, (n,): u, p^e, MW added, factor on x (None: nothing)."""
+    """Inputs with the effect of causes, (n,): u, p^e, MW added, factor on x (None: no effect)."""
 
     u: FloatArray
     scale: FloatArray
@@ -41,7 +41,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Extended:
-    """A model with the causes found so far; none of them is the plain simulation."""
+    """A model with the causes found so far; without causes it is the plain simulation."""
 
     base: RegionalModel
     active: tuple[Active, ...] = ()
@@ -52,19 +52,19 @@ class Extended:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the causes' names in the order found."""
+        """Return the names of the causes in the order found."""
         return tuple(a.name for a in self.active)
 
     @property
     def regional(self) -> RegionalModel:
-        """Return curve and dynamics with what causes change in them."""
+        """Return curve and dynamics, including the changes by causes of the dynamics."""
         model = self.base
         for a in self.at(Stage.DYNAMICS):
             model = a.cause.act(model, a.values)
         return model
 
     def without_causes(self) -> Extended:
-        """Return curve and dynamics alone."""
+        """Return the model without its causes."""
         return replace(self, active=())
 
     def with_cause(self, added: Active) -> Extended:
@@ -83,7 +83,7 @@ class Extended:
 
 
 def _input(grids: Grids, model: Extended) -> FloatArray:
-    """Return u behind what the valve does to the opening; the last few are remembered."""
+    """Return u for the opening with its causes applied; the last few results are cached."""
     chain = sorted(model.at(Stage.OPENING), key=lambda a: a.cause.order)
     if not chain:
         return grids.u
@@ -101,7 +101,7 @@ def _input(grids: Grids, model: Extended) -> FloatArray:
 
 
 def drive(grids: Grids, model: Extended) -> Drive:
-    """Return what acts on the curve and behind it."""
+    """Return the inputs of the curve and the changes of its output."""
     u, scale = _input(grids, model), grids.scale
     for a in model.at(Stage.INPUT):
         factor = a.cause.act(u, a.values, grids, model.base)
@@ -121,7 +121,7 @@ def drive(grids: Grids, model: Extended) -> Drive:
 
 
 def acts_on_scale(a: Active, form: StaticForm) -> bool:
-    """Return whether a cause of the input changes p^e: one of the pressure does, if there is e."""
+    """Return True if a cause changes p^e, not u: a cause of the pressure in a form with e."""
     return form.scaled and a.cause.family == 'nozzle'
 
 
@@ -152,10 +152,10 @@ def answer(
     Parameters
     ----------
     driven : Drive, optional
-        Of this model, if known already.
+        For this model, if already computed.
     path : uint8 (n,), optional
-        Regions to keep to. While one differentiates they must not flip: a tangent would
-        become a row of spikes.
+        Fixed regions of the rows. They must not change during differentiation: the derivative
+        would have spikes.
     """
     x = flow_of(model, driven if driven is not None else drive(grids, model))
     if path is None:
@@ -173,24 +173,24 @@ def answer(
     return grids.means(y)
 
 
-# An extended model as it is kept: with the zero of its time and what its causes count from.
+# An extended model as stored: with its start time and the reference values of its causes.
 
 
 @dataclass(frozen=True, slots=True)
 class ExtendedModel:
-    """What ``extended_model.json`` holds.
+    """The content of ``extended_model.json``.
 
     Attributes
     ----------
     model : Extended
     form : StaticForm
     start_ns : int
-        Time that drifts and onsets count from.
+        Start time for drifts and onsets.
     reference : Reference
-        Of the record the causes were found in.
+        Reference values of the record in which the causes were found.
     on_top_of : ExtendedModel, optional
-        An earlier model: the causes of this one were found in rows that had been freed of
-        the earlier ones.
+        An earlier model: the causes of this one were found in rows from which the causes of
+        the earlier one had been removed.
     output_unit : str
         MW, or the unit of a flow.
     """
@@ -209,7 +209,7 @@ class ExtendedModel:
 
     @property
     def held(self) -> tuple[HeldCause, ...]:
-        """Return the causes, the earlier ones first."""
+        """Return the causes, those of the earlier model first."""
         earlier = () if self.on_top_of is None else self.on_top_of.held
         return earlier + tuple(
             HeldCause(
@@ -221,7 +221,7 @@ class ExtendedModel:
         )
 
     def characteristic(self) -> Characteristic:
-        """Return the curve of the plant without the causes; how sure it is stands nowhere."""
+        """Return the curve of the plant without the causes; its uncertainty is not stored."""
         nan = math.nan
         return Characteristic(
             pressure_exponent=self.pressure_exponent,
@@ -261,5 +261,5 @@ def _dynamics(m: RegionalModel, scale: FloatArray | float) -> tuple[RegionDynami
             math.nan, math.nan,
         )
         for i in range(m.regions)
-        if edges[i] < edges[i + 1]  # a level beyond the curve's ends leaves a region empty
+        if edges[i] < edges[i + 1]  # a level outside the curve gives an empty region
     )  # fmt: skip

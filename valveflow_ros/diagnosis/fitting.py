@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Fit an extended model by its prediction error: tangents, Gauss-Newton, line searches."""
+"""Fit an extended model by prediction error: tangents, Gauss-Newton, line searches."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import BoolArray, FloatArray
 
-# Causes whose path depends on noise nobody measured: several draws, weighed by the power.
+# Causes that depend on unmeasured noise: simulations with several noise realisations.
 #
-# A valve that sticks slips when the pull passes a threshold, and the noise of the position
-# sensor decides on which side of it a row lies. One simulated path soon leaves the true one
-# until both slip again. Several paths, each with noise of its own, are run; the power measured
-# *before* a row says how much each is believed in that row. The past weighs less and less, so
-# that a path that went astray can come back.
+# A sticking valve slips when the distance to the command exceeds a threshold, and the noise of the
+# position sensor decides on which side of it a row lies. A single simulated path soon leaves the
+# true one, until both slip again. So several paths with different noise are simulated. The power
+# measured *before* a row gives the weight of each path in that row. Old rows count less, so that
+# a wrong path can regain weight.
 #
-# The rule is that of the fixed-share forecaster (Herbster and Warmuth, Machine Learning 32, 1998,
-# 151): it never looks at the row it predicts, so that it gains nothing where the cause is absent.
+# This is the fixed-share forecaster (Herbster and Warmuth, Machine Learning 32, 1998, 151). It
+# does not use the row that it predicts, so it gains nothing if the cause is absent.
 
 _EVERY = 7  # rows are enough for a median
-_OF_NORMAL = 0.455  # the median square of a standard normal variable
-_SHARED = 0.005  # of the belief that goes round at every mean: one change in half an hour
+_OF_NORMAL = 0.455  # the median of a squared standard normal variable
+_SHARED = 0.005  # weight redistributed at every mean: one change in half an hour
 
 
 @jit
 def beliefs(
     white: FloatArray, good: BoolArray, variance: float, shared: float, out: FloatArray
 ) -> None:
-    """Write how much each of several predictions is believed in every row.
+    """Compute the weights of several predictions in every row.
 
     Parameters
     ----------
@@ -50,11 +50,11 @@ def beliefs(
     good : bool (m,)
         Rows whose whitened residuals count.
     variance : float
-        Of a whitened residual where the prediction is right.
+        Variance of a whitened residual if the prediction is right.
     shared : float
-        Part of the belief that is given to all alike at every row.
+        Fraction of the weight that is distributed equally at every row.
     out : float64 (k, m)
-        Columns sum to 1.
+        Weights; each column sums to 1.
     """
     count = white.shape[0]
     belief = np.full(count, 1.0 / count)
@@ -72,14 +72,14 @@ def beliefs(
 
 
 def drawn(model: Extended) -> Active | None:
-    """Return the cause of a model that is drawn, None if there is none."""
+    """Return the cause of a model that uses noise realisations; None if there is none."""
     return next((a for a in model.active if a.cause.draws), None)
 
 
 def _believed(
     grids: Grids, model: Extended, a: Active, ar: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residuals and beliefs of all draws, both (k, m)."""
+    """Return residuals and weights of all realisations, both (k, m)."""
     rest = np.empty((a.cause.draws, len(grids.power)))
     for k in range(a.cause.draws):
         one = replace(model, active=tuple(_single(b, k) if b is a else b for b in model.active))
@@ -93,14 +93,14 @@ def _believed(
 
 
 def believed_residual(grids: Grids, model: Extended, a: Active, ar: FloatArray) -> FloatArray:
-    """Return the residual of the believed mean of all draws in MW, shape (m,).
+    """Return the residual of the weighted mean of all realisations in MW, shape (m,).
 
     Parameters
     ----------
     a : Active
-        The cause of the model that is drawn.
+        The cause of the model that uses noise realisations.
     ar : float64 (p,)
-        Of the noise.
+        AR coefficients of the noise.
     """
     rest, belief = _believed(grids, model, a, ar)
     return np.asarray(np.einsum('km,km->m', rest, belief))
@@ -108,23 +108,23 @@ def believed_residual(grids: Grids, model: Extended, a: Active, ar: FloatArray) 
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """The believed path of the plug in one record, for the values it was found with."""
+    """The weighted mean path of the plug in one record, for fixed parameter values."""
 
     path: FloatArray
     values: Values
     usual: Callable[..., FloatArray]
 
     def __call__(self, v: FloatArray, values: Values, grids: Grids) -> FloatArray:
-        """Act as found, or as usual for another record or other values."""
+        """Return the stored path; for another record or other values, apply the cause."""
         if values == self.values and len(v) == len(self.path):
             return self.path
         return self.usual(v, values, grids)
 
 
 def held(grids: Grids, model: Extended, ar: FloatArray) -> Extended:
-    """Return the model with the believed path in place of the draws; its parameters stay.
+    """Return the model with the weighted mean path in place of the realisations.
 
-    Everything else can then be fitted at the usual speed.
+    The parameters of that cause are fixed; the others can then be fitted at the usual speed.
     """
     a = drawn(model)
     if a is None or a.cause.draw is None or a is not _first_of_opening(model):
@@ -143,7 +143,7 @@ def held(grids: Grids, model: Extended, ar: FloatArray) -> Extended:
 
 
 def free(model: Extended, causes: Mapping[str, Cause]) -> Extended:
-    """Return the model with every cause as the catalogue has it."""
+    """Return the model with every cause as defined in the catalogue."""
     return replace(
         model, active=tuple(replace(a, cause=causes[a.name]) for a in model.active)
     )  # fmt: skip
@@ -155,7 +155,7 @@ def _first_of_opening(model: Extended) -> Active:
 
 
 def _single(a: Active, draw: int) -> Active:
-    """Return the cause as one of its draws; ``extra`` tells the draws apart."""
+    """Return the cause with one of its noise realisations; ``extra`` holds the number of it."""
     assert a.cause.draw is not None
     return replace(
         a, cause=replace(a.cause, act=a.cause.draw(draw), draws=0), extra=(float(draw),)
@@ -163,7 +163,7 @@ def _single(a: Active, draw: int) -> Active:
 
 
 def _variance(white: FloatArray) -> float:
-    """Return the variance where a draw is right, which is most of the time."""
+    """Return the variance at times when a realisation is right, which is most of the time."""
     squares = white[:, ::_EVERY] ** 2
     return max(float(np.median(np.median(squares, axis=1))) / _OF_NORMAL, 1e-12)
 
@@ -176,9 +176,9 @@ _LARGEST_SUM = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What a fit works on: the record, the rows that count, the whitening, what may move.
+    """The inputs of a fit: the record, the rows used, the whitening, the free parameters.
 
-    ``fixed_dynamics`` holds time constants, delays and levels, as for a given model.
+    ``fixed_dynamics`` keeps time constants, delays and levels fixed, as for a given model.
     """
 
     grids: Grids
@@ -187,7 +187,7 @@ class Task:
     fixed_dynamics: bool = False
 
     def innovations(self, series: FloatArray) -> FloatArray:
-        """Return whitened rows that count of a series (m,) or table (m, k)."""
+        """Return the used rows of a series (m,) or table (m, k), whitened."""
         out = series.copy()
         for k, a in enumerate(self.ar, start=1):
             out[k:] -= a * series[:-k]
@@ -206,10 +206,10 @@ class Task:
 
 
 def whitening(grids: Grids, residual: FloatArray) -> FloatArray:
-    """Return AR coefficients of a residual freed of what wanders over hours, shape (4,).
+    """Return AR coefficients of a residual after removing its slow part, shape (4,).
 
-    A misfit that lasts for hours must not be taken for correlation of the noise:
-    whitened away it could not be named any more.
+    A misfit that lasts for hours must not be treated as correlation of the noise: whitening
+    would remove it, and its cause could not be found.
     """
     weight = grids.open_rows.astype(np.float64)
     kernel = np.ones(min(_SLOW_MEANS, max(1, len(residual) // 4)))
@@ -223,13 +223,13 @@ def whitening(grids: Grids, residual: FloatArray) -> FloatArray:
 
 
 def base_mask(task: Task, model: Extended) -> BoolArray:
-    """Return which packed parameters of curve and dynamics may move."""
+    """Return which packed parameters of curve and dynamics are free."""
     free = free_parameters(model.base)
     if task.fixed_dynamics:
         delays = model.base.delay_places
         free[delays.start - model.base.regions : delays.stop] = False
     elif 'clock' in model.names:
-        # Only delay minus lead shows, so the shortest delay stays where it is.
+        # Only the delay minus the clock offset is observable, so the shortest delay is fixed.
         free[model.base.delay_places.start + int(np.argmin(model.base.delays))] = False
     return free
 
@@ -261,7 +261,7 @@ def base_tangents(task: Task, model: Extended) -> FloatArray:
 
 
 def _slots(model: Extended) -> list[tuple[int, int]]:
-    """Return (cause, parameter) of every parameter that Gauss-Newton moves."""
+    """Return (cause, parameter) of every parameter fitted by Gauss-Newton."""
     return [
         (c, k)
         for c, a in enumerate(model.active)
@@ -297,7 +297,7 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
 
 
 def level_tangents(task: Task, model: Extended) -> FloatArray:
-    """Return differences by the levels of the regions, letting rows change region, (m, I - 1)."""
+    """Return derivatives by the levels, where rows may change their region, (m, I - 1)."""
     if task.fixed_dynamics or not len(model.base.levels):
         return np.empty((len(task.grids.power), 0))
     columns = []
@@ -313,8 +313,8 @@ def level_tangents(task: Task, model: Extended) -> FloatArray:
 def levels_along(before: RegionalModel, after: RegionalModel, scale: float = 1.0) -> RegionalModel:
     """Move the levels with the curve, so that the regions change at the same u as before.
 
-    A level that stays while the curve moves by a MW costs more than most causes gain. Where the
-    flow depends on the pressure besides, that holds at one pressure, whose p^e is ``scale``.
+    If a level stays while the curve moves by 1 MW, the cost rises more than most causes reduce it.
+    If the flow also depends on the pressure, this holds at one pressure with p^e = ``scale``.
     """
     if not len(before.levels) or np.any(before.right <= before.left):
         return after
@@ -327,7 +327,7 @@ def levels_along(before: RegionalModel, after: RegionalModel, scale: float = 1.0
 
 
 def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
-    """Return the model moved by a step, within bounds; None if knots come too close."""
+    """Return the model after a step, within bounds; None if breakpoints come too close."""
     free = np.flatnonzero(base_mask(task, model))
     packed = model.base.pack()
     packed[free] += step[: len(free)]
@@ -346,13 +346,13 @@ def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
 def improve(
     task: Task, model: Extended, steps: int, frozen_base: FloatArray | None = None
 ) -> tuple[Extended, float]:
-    """Levenberg-Marquardt over curve, dynamics and causes.
+    """Apply Levenberg-Marquardt to curve, dynamics and causes.
 
     Parameters
     ----------
     frozen_base : float64 (m, P), optional
-        Tangents of curve and dynamics to be used throughout; they change little, and
-        taking them anew costs most of the time.
+        Tangents of curve and dynamics, kept constant; they change little, and their
+        computation takes most of the time.
     """
 
     def equations(model: Extended) -> tuple[FloatArray, FloatArray]:
@@ -369,7 +369,7 @@ def improve(
 def search_levels(
     task: Task, model: Extended, cost: float, steps: tuple[float, ...] = _LEVEL_STEPS_MW
 ) -> tuple[Extended, float]:
-    """Move each level between regions along a line while the cost falls."""
+    """Adjust each level between regions with a line search."""
     size = task.grids.size
 
     def moved(model: Extended, level: int, by: float) -> Extended | None:
@@ -383,7 +383,7 @@ def search_levels(
 
 
 def _directions(cause: Cause, grids: Grids) -> list[Values]:
-    """Return steps along which parameters of kind ``LINE`` are searched: each, and in pairs."""
+    """Return the search directions of parameters of kind ``LINE``: each, and in pairs."""
     lines = [k for k, u in enumerate(cause.unknowns) if u.kind is Kind.LINE]
     out = []
     for k in lines:
@@ -403,7 +403,7 @@ def _along(model: Extended, c: int, direction: Values, by: float) -> Extended:
 
 
 def search_lines(task: Task, model: Extended, cost: float) -> tuple[Extended, float]:
-    """Move every parameter of kind ``LINE`` along a line while the cost falls."""
+    """Adjust every parameter of kind ``LINE`` with a line search."""
     return _search_lines(task, model, cost, range(len(model.active)))
 
 
@@ -422,13 +422,13 @@ def _search_lines(
 
 
 def search_onsets(task: Task, model: Extended) -> Extended:
-    """Move onsets along the time while the cost falls; everything else stays."""
+    """Adjust the onsets with a line search; everything else stays fixed."""
     dated = [c for c, a in enumerate(model.active) if any(u.dated for u in a.cause.unknowns)]
     return _search_lines(task, model, task.cost(model), dated)[0]
 
 
 def settle(task: Task, model: Extended, rounds: int, steps: int) -> tuple[Task, Extended, float]:
-    """Alternate between parameters, levels, lines and whitening until all agree."""
+    """Alternate between parameters, levels, line searches and whitening until convergence."""
     cost = np.inf
     for _ in range(rounds):
         model, cost = improve(task, model, steps)

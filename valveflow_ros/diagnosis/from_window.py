@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Diagnose what the running monitor holds: a pure function of a snapshot."""
+"""Diagnose the window of the running monitor: a pure function of a snapshot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from valveflow_ros.records import FloatArray, IntArray, Quality, SampleTable, Si
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.static_form import StaticForm, pressure_of
 
-# A model to begin with where special segments give none.
+# An initial model if the special segments give none.
 
 _PIECES, _MOST = 4, 6
 _LEAST_SPREAD = 0.02
@@ -33,12 +33,12 @@ _LEAST_SPREAD = 0.02
 def first_model(
     table: SampleTable, step_s: float, form: StaticForm, settle_s: float
 ) -> RegionalModel:
-    """Fit curve and dynamics to all rows, beginning with a regression on hats of u.
+    """Fit curve and dynamics to all rows, starting from a regression on hat functions of u.
 
     Raises
     ------
     DataError
-        The valve hardly moves, or too little was measured.
+        The valve hardly moves, or there is too little data.
     """
     u, scale = form.of_rows(
         table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE)
@@ -68,7 +68,7 @@ def first_model(
 def _hats(
     u: FloatArray, knots: FloatArray, power: FloatArray, scale: FloatArray | None
 ) -> tuple[FloatArray, float | None]:
-    """Return the least squares values at the knots, and c where the form has one."""
+    """Return the least-squares values at the breakpoints, and c if the form has one."""
     knots += np.arange(len(knots)) * 1e-6 * (knots[-1] - knots[0])
     table = np.column_stack([np.interp(u, knots, row) for row in np.eye(len(knots))])
     if scale is not None:
@@ -77,23 +77,23 @@ def _hats(
     return (found, None) if scale is None else (found[:-1], float(found[-1]))
 
 
-# A record freed of the causes of an earlier model, to be diagnosed on top of it.
+# A record without the causes of an earlier model, for a diagnosis on top of that model.
 
 
 def on_top(record: Record, earlier: ExtendedModel, measured: SampleTable) -> Record:
-    """Return the record with what a diagnosis on top of an earlier model needs.
+    """Return the record for a diagnosis on top of an earlier model.
 
     Parameters
     ----------
     record : Record
-        Its table was freed of the causes of ``earlier``.
+        Its table has the causes of ``earlier`` removed.
     measured : SampleTable
-        The rows of the record before that.
+        The rows of the record before the removal.
 
     Notes
     -----
-    Where the opening was changed it is no longer the position that a command leads to, so
-    the command is left out: it would show the earlier cause again.
+    If the opening was changed, it no longer follows from the command. So the command is left
+    out: otherwise the diagnosis would find the earlier cause again.
     """
     rows = record.table
     if _changes_opening(earlier):
@@ -105,10 +105,10 @@ def on_top(record: Record, earlier: ExtendedModel, measured: SampleTable) -> Rec
 
 
 def freed(record: Record, held: tuple[HeldCause, ...]) -> Record:
-    """Return a record whose rows were freed of causes, where those as measured are gone.
+    """Return a record with removed causes whose measured rows are not available.
 
-    A stop or a slack that was taken into the opening lets it rest for hours, which is no dead
-    transmitter: faults of the opening are not looked for then.
+    A corrected opening may be constant for hours at a stop or inside a backlash; this is not a
+    transmitter fault. So faults of the opening are not searched for in that case.
     """
     if not any(catalogue()[h.name].stage == Stage.OPENING for h in held):
         return record
@@ -125,8 +125,8 @@ def _changes_opening(model: ExtendedModel | None) -> bool:
     )
 
 
-# A pressure that u was made of and that is made of u again differs in its last bits, which would
-# hide that it stood still.
+# Computing u from a pressure and the pressure from u changes its last digits, which would hide
+# that the pressure was constant.
 _DECIMALS = 9
 
 
@@ -136,12 +136,12 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
     Raises
     ------
     DataError
-        The window cannot carry a diagnosis; the sentence says why.
+        The window is not sufficient for a diagnosis; the message says why.
 
     Notes
     -----
-    The curve in force is where the diagnosis begins; its dynamics and the number of its pieces
-    follow the window, as those of `valveflow diagnose` without a model do.
+    The diagnosis starts from the current curve. The dynamics and the number of pieces are fitted
+    to the window, as in `valveflow diagnose` without a model.
     """
     settings, contents = task.settings, task.contents
     form, step_s = task.curve.static_form, settings.real('sample_period')
@@ -156,7 +156,7 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
 
 
 def table_of(contents: WindowContents, exponent: float) -> SampleTable:
-    """Return the rows of a window as a table; the pressure is the one u = V p^m was made with."""
+    """Return the rows of a window as a table, with the pressure used in u = V p^m."""
     opening = contents.opening_percent
     columns = {
         Signal.VALVE_OPENING: opening,
@@ -172,7 +172,7 @@ def table_of(contents: WindowContents, exponent: float) -> SampleTable:
 
 
 def _spans_ns(contents: WindowContents) -> IntArray:
-    """Return first and last time of the special segments, shape (k, 2)."""
+    """Return the first and last time of the special segments, shape (k, 2)."""
     spans = contents.spans
     if not len(spans):
         return np.empty((0, 2), dtype=np.int64)

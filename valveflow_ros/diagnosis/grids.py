@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A record on the grids the diagnosis works on: fine rows, model rows, scored means, blocks."""
+"""A record on the grids of the diagnosis: fine rows, model rows, scored means, blocks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ORDER = 4
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What causes count from; kept with an extended model, so that it means the same elsewhere.
+    """Reference values of causes; stored with an extended model and used for other records too.
 
     Attributes
     ----------
@@ -33,9 +33,9 @@ class Reference:
     temperature_degc, log_pressure : float
         Means over it.
     pressure_level, pressure_slope : float
-        Line of the sliding pressure over the power, MPa and MPa per MW.
+        Straight line of the sliding pressure over the power, MPa and MPa per MW.
     opening_noise : float
-        Standard deviation of the white noise of the opening, %; 0 where it is not known.
+        Standard deviation of the white noise of the opening, %; 0 if unknown.
     """
 
     span_s: float
@@ -48,18 +48,18 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Blur:
-    """What the way of recording hides.
+    """Effects that sampling or compression of the record hides.
 
     Attributes
     ----------
     time_s : float
-        Lags and delays below this cannot be judged.
+        Lags and delays below this value cannot be judged.
     opening_percent : float
-        Nor can a slack of the valve below this.
+        A backlash of the valve below this value cannot be judged.
     words : str
-        Why, up to what is hidden; empty if nothing is.
+        The reason, as the beginning of a sentence; empty if nothing is hidden.
     compressed : bool
-        Values were held.
+        True if values were held constant by compression.
     """
 
     time_s: float = 0.0
@@ -70,16 +70,16 @@ class Blur:
 
 @dataclass(frozen=True, slots=True)
 class Covariate:
-    """A column beside the signals that the power may follow.
+    """A column in addition to the signals that the power may follow.
 
     Attributes
     ----------
     name : str
-        What the person calls it; also the name of the cause.
+        Name given by the user; also the name of the cause.
     column, unit : str
-        Column or topic it comes from, and its unit ('' where not known).
+        Column or topic that it comes from, and its unit ('' if unknown).
     spread : float
-        Standard deviation of its departure from what is usual at the load, in that unit.
+        Standard deviation from the usual value at the load, in that unit.
     power_mw : float
         Mean of the power over the record.
     centre : tuple of float
@@ -87,7 +87,7 @@ class Covariate:
     surface : tuple of float
         Load over ``power_mw``: coefficients of the powers of scaled u and pressure up to 3.
     course : tuple of float
-        What is usual at a load: coefficients of the powers 0 to 2 of that.
+        Usual value at a load: coefficients of the powers 0 to 2 of the load.
     """
 
     name: str
@@ -100,19 +100,19 @@ class Covariate:
     course: tuple[float, ...]
 
     def usual(self, u: FloatArray, pressure: FloatArray) -> FloatArray:
-        """Return the covariate that is usual at an input and a pressure in MPa, shape (n,)."""
+        """Return the usual covariate at an input and a pressure in MPa, shape (n,)."""
         return np.asarray(
             np.polynomial.polynomial.polyval(self.load(u, pressure), np.array(self.course))
         )
 
     def load(self, u: FloatArray, pressure: FloatArray) -> FloatArray:
-        """Return about how much of ``power_mw`` an input and a pressure give, shape (n,)."""
+        """Return the load relative to ``power_mw`` at an input and a pressure, shape (n,)."""
         return np.asarray(_powers(u, pressure, self.centre) @ np.array(self.surface))
 
 
 _CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))
 COEFFICIENTS, COURSE = len(_CUBIC), 3
-_FAR = 2.5  # standard deviations beyond which the surface is level
+_FAR = 2.5  # standard deviations beyond which the surface is constant
 
 
 def _powers(u: FloatArray, pressure: FloatArray, centre: tuple[float, ...]) -> FloatArray:
@@ -124,7 +124,7 @@ def _powers(u: FloatArray, pressure: FloatArray, centre: tuple[float, ...]) -> F
 
 @dataclass(frozen=True, slots=True)
 class CovariateRows:
-    """The values of a covariate on the rows of a table, (rows,); NaN where there is none."""
+    """The values of a covariate on the rows of a table, (rows,); NaN if missing."""
 
     name: str
     column: str
@@ -134,7 +134,7 @@ class CovariateRows:
 
 @dataclass(frozen=True, slots=True)
 class Grids:
-    """Everything measured, as arrays that the model and the statistics need.
+    """All measurements as arrays for the model and the statistics.
 
     Attributes
     ----------
@@ -142,9 +142,9 @@ class Grids:
         Time of the first row, step of the fine rows and of the model rows.
     form : StaticForm
     v, density : float64 (nn,)
-        Opening in % and p^q on the fine grid, NaN where there is none.
+        Opening in % and p^q on the fine grid, NaN if missing.
     command : float64 (nn,)
-        Commanded opening in %, NaN where there is none.
+        Commanded opening in %, NaN if missing.
     u, pressure, temperature, time_s : float64 (n,)
         Model rows: V p^q, MPa, degC, seconds since the first row.
     scale : float64 (n,)
@@ -155,13 +155,13 @@ class Grids:
     scored : bool (m,)
         Means with power whose inputs have settled.
     whole : bool (m,)
-        Scored, with the history that whitening needs.
+        Scored, with enough earlier means for whitening.
     sub : int64 (m,)
-        Which sub-block a mean lies in.
+        Sub-block of each mean. Sub-blocks form blocks; the sealed blocks are the test data.
     reference : Reference
     blur : Blur
     covariates : dict
-        By name, a covariate and its values on the model rows, shape (n,); gaps are bridged.
+        Covariate by name, with its values on the model rows, shape (n,); gaps are interpolated.
     """
 
     start_ns: int
@@ -194,7 +194,7 @@ class Grids:
 
     @property
     def size(self) -> float:
-        """Return how large the output is beside that of a unit of 300 MW; see `output_size`."""
+        """Return the output range relative to a unit of 300 MW; see `output_size`."""
         return output_size(self.power)
 
     @property
@@ -209,12 +209,12 @@ class Grids:
 
     @property
     def block_of_sub(self) -> np.ndarray:
-        """Return the block each sub-block lies in, shape (subs,)."""
+        """Return the block of each sub-block, shape (subs,)."""
         return np.arange(self.subs) // SUBS_IN_BLOCK
 
     @property
     def fold_of_sub(self) -> np.ndarray:
-        """Return the fold of each sub-block; `SEALED_FOLD` is sealed."""
+        """Return the fold of each sub-block; `SEALED_FOLD` is the test fold."""
         return self.block_of_sub % FOLDS
 
     @property
@@ -224,12 +224,12 @@ class Grids:
 
     @property
     def open_rows(self) -> BoolArray:
-        """Return the whole means outside the sealed blocks, shape (m,)."""
+        """Return the whole means outside the sealed blocks (training data), shape (m,)."""
         return np.asarray(self.whole & (self.fold_of_sub[self.sub] != SEALED_FOLD))
 
     @property
     def sealed_rows(self) -> BoolArray:
-        """Return the whole means inside the sealed blocks, shape (m,)."""
+        """Return the whole means inside the sealed blocks (test data), shape (m,)."""
         return np.asarray(self.whole & (self.fold_of_sub[self.sub] == SEALED_FOLD))
 
     @property
@@ -240,7 +240,7 @@ class Grids:
         return np.asarray(ends - 0.5 * count * self.mean_s)
 
     def clock_s(self, time_s: FloatArray) -> FloatArray:
-        """Return the seconds since a midnight UTC of times since the first row."""
+        """Return times since the first row as seconds since a midnight UTC."""
         first = self.start_ns % (int(DAY_S) * NS_PER_S) / NS_PER_S
         return np.asarray(np.mod(time_s + first, DAY_S))
 
@@ -257,25 +257,25 @@ class Grids:
         return out
 
 
-# The noise of the position sensor: what it adds to an opening that wanders.
+# The noise of the position sensor, estimated while the opening varies.
 
-_KEPT = 0.8  # share of the increments that are no pulses of the frequency control
-_OF_NORMAL = 0.4377  # their mean square in units of the whole, for a normal law
+_KEPT = 0.8  # fraction of the increments without moves of the frequency control
+_OF_NORMAL = 0.4377  # mean square of that fraction relative to all, for a normal distribution
 _PARTS, _LEAST_ROWS = 12, 50
 
 
 def sensor_noise(v: FloatArray) -> float:
-    """Return the sd of the white noise of a position in its own unit, rather too large than small.
+    """Return an upper estimate of the sd of the white noise of a position, in its own unit.
 
-    Rows apart by h differ by D(h) = E (v[t + h] - v[t])^2, which noise lifts by twice its
-    variance however small h is. A parabola through D(1), D(2), D(3), at h = 0, is that lift.
-    It is taken from parts of the record, and their standard error is added: paths drawn with no
-    noise at all would be one path.
+    Rows at a distance of h differ by D(h) = E (v[t + h] - v[t])^2. White noise adds twice its
+    variance to D at every h > 0; a parabola through D(1), D(2), D(3), extrapolated to h = 0, gives
+    this part. It is computed on parts of the record, and the standard error of their mean is
+    added: simulated paths with zero noise would all be identical.
 
     Parameters
     ----------
     v : float64 (n,)
-        Positions at a constant step, NaN where there is none.
+        Positions at a constant step, NaN if missing.
     """
     parts = [p for p in np.array_split(v, _PARTS) if np.isfinite(p).sum() >= _LEAST_ROWS]
     if not parts:
@@ -286,30 +286,30 @@ def sensor_noise(v: FloatArray) -> float:
 
 
 def _lift(v: FloatArray) -> float:
-    """Return twice the variance of the noise, as told by one part; it may be negative."""
+    """Return twice the variance of the noise, estimated from one part; it may be negative."""
     lifted = []
     for h in (1, 2, 3):
         apart = np.abs(v[h:] - v[:-h])
         apart = apart[np.isfinite(apart)]
         if not len(apart):
             return 0.0
-        # So many, not those below a limit: on a rounded record thousands lie at the limit.
+        # A fixed number, not all below a limit: in a rounded record thousands equal the limit.
         count = max(1, round(_KEPT * len(apart)))
         kept = np.partition(apart, count - 1)[:count]
         lifted.append(float(np.mean(kept**2)) / _OF_NORMAL)
     return 3.0 * lifted[0] - 3.0 * lifted[1] + lifted[2]
 
 
-# What the way of recording hides.
+# Effects hidden by sampling and compression.
 
 _COARSE_STEP_S = 20.0
 _STEPS_HIDDEN = 1.0  # lags shorter than this many steps of a coarse table
-_MOVES_HIDDEN = 3.0  # a slack below this many usual moves of the opening within a row
+_MOVES_HIDDEN = 3.0  # a backlash below this many typical moves of the opening within a row
 _BANDS_HIDDEN = 4.0  # or this many dead bands
 
 
 def blur_of(v: FloatArray, step_s: float, compression: Compression | None) -> Blur:
-    """Return what a record with this step, or one compressed like this, hides.
+    """Return what this step or compression of a record hides.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def _usual_move(v: FloatArray) -> float:
     return _MOVES_HIDDEN * float(np.quantile(moves, 0.9)) if len(moves) else 0.0
 
 
-# From a table of samples to the grids of a `Grids`.
+# Conversion of a table of samples to `Grids`.
 
 _BRIDGE_S = 30.0
 _BEFORE_GAP_S = 60.0
@@ -364,17 +364,17 @@ def make_grids(
     step_s : float
         Step of the table.
     exponent : float
-        Of the pressure in u, eq. (1).
+        Exponent of the pressure in u, eq. (1).
     settle_s : float
         Rows this long after a gap are not scored.
     bad : bool (rows, 5)
-        Values that are not believed.
+        Invalid values.
     rough : bool
-        With longer model rows, for looking round quickly; the scored means are the same.
+        Use longer model rows, for faster screening; the scored means are the same.
     compression : Compression, optional
         How the record was compressed, if it was.
     covariates : tuple of CovariateRows
-        On the rows of the table.
+        Covariates on the rows of the table.
 
     Raises
     ------
@@ -394,7 +394,7 @@ def make_grids(
     )
     with np.errstate(invalid='ignore'):
         positive = np.where(p > 0.0, p, np.nan)
-        # Where p is not known the first power of it is not either, nor is then u.
+        # If p is unknown, its power and u are unknown too.
         density = np.where(np.isfinite(positive), positive**form.input_exponent, np.nan)
 
     def coarse(x: FloatArray) -> FloatArray:
@@ -442,10 +442,10 @@ def make_grids(
 def _covariate(
     rows: CovariateRows, values: FloatArray, u: FloatArray, pressure: FloatArray, power: FloatArray
 ) -> tuple[Covariate, FloatArray]:
-    """Return a covariate with what is usual of it at each load, and its values.
+    """Return a covariate with its usual value at each load, and its values.
 
-    The load is a smooth function of u and pressure, so that no noise of the power comes in. It
-    weighs the rows, as the cause multiplies by it.
+    The load is a smooth function of u and pressure, so it contains no noise of the power. Rows are
+    weighted by the load, because the cause multiplies by it.
     """
     a, b, c = (x.reshape(len(power), -1).mean(axis=1) for x in (u, pressure, values))
     here = np.isfinite(power) & np.isfinite(a)
@@ -488,13 +488,13 @@ def _longer(factor: int, group: int, step_s: float) -> tuple[int, int]:
 
 
 def _sub_rows(means: int, mean_s: float) -> int:
-    """Return the means in a sub-block: half an hour, less where a record is short."""
+    """Return the number of means in a sub-block: half an hour, less in a short record."""
     span = means * mean_s
     return max(6, round(min(SUB_S, max(300.0, span / 160.0)) / mean_s))
 
 
 def _on_grid(table: SampleTable, step_s: float, bad: BoolArray) -> FloatArray:
-    """Return the values on an even grid, NaN where a row is missing or not believed."""
+    """Return the values on an even grid, NaN where a row is missing or invalid."""
     return _spread(table, step_s, np.where(bad, np.nan, table.values))
 
 
@@ -507,7 +507,7 @@ def _spread(table: SampleTable, step_s: float, values: FloatArray) -> FloatArray
 
 
 def _bridged(x: FloatArray, longest: int) -> FloatArray:
-    """Return a series whose short gaps are filled in a straight line."""
+    """Return a series whose short gaps are filled by linear interpolation."""
     good = np.isfinite(x)
     if good.all() or not good.any():
         return x
@@ -522,7 +522,7 @@ def _bridged(x: FloatArray, longest: int) -> FloatArray:
 
 
 def _everywhere(x: FloatArray) -> FloatArray:
-    """Return a series without NaN: what is missing is taken from its neighbours."""
+    """Return a series without NaN: missing values are interpolated."""
     good = np.flatnonzero(np.isfinite(x))
     return np.interp(np.arange(len(x)), good, x[good]) if len(good) else np.zeros(len(x))
 
@@ -537,7 +537,7 @@ def _power(power: FloatArray, rows: int) -> tuple[FloatArray, BoolArray]:
 
 
 def _settled(usable: ByteArray, settle_s: float, step_s: float) -> BoolArray:
-    """Return where the model has forgotten the last gap and the next one is not near."""
+    """Return where the effect of the last gap has decayed and the next gap is not near."""
     out = np.empty(len(usable), dtype=np.uint8)
     kernels.settled(usable, round(settle_s / step_s), out)
     ahead = round(_BEFORE_GAP_S / step_s)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The loops of the extended model: an answer by regions, and what a valve does to a position."""
+"""The inner loops of the extended model: regional dynamics and valve operators."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def regions(x: FloatArray, levels: FloatArray, out: ByteArray) -> None:
 def respond(
     x: FloatArray, usable: ByteArray, region: ByteArray, taps: FloatArray, out: FloatArray
 ) -> None:
-    """Filter the flow by the taps of the region each row lies in; a gap begins in equilibrium."""
+    """Filter the flow with the taps of the region of each row; a gap starts in equilibrium."""
     state = 0.0
     age = 0
     for t in range(x.size):
@@ -56,7 +56,7 @@ def respond_means(
     group: int,
     out: FloatArray,
 ) -> None:
-    """Do what `respond` does and write only means over ``group`` rows."""
+    """Do the same as `respond`, but write only means over ``group`` rows."""
     state = 0.0
     age = 0
     for b in range(out.size):
@@ -93,7 +93,7 @@ def bump(u: FloatArray, centre: float, width: float, out: FloatArray) -> None:
 
 @jit
 def settled(usable: ByteArray, rows: int, out: ByteArray) -> None:
-    """Write 1 where the last gap lies more than ``rows`` rows back."""
+    """Write 1 where the last gap is more than ``rows`` rows before."""
     age = 0
     for t in range(usable.size):
         age = age + 1 if usable[t] else 0
@@ -102,13 +102,13 @@ def settled(usable: ByteArray, rows: int, out: ByteArray) -> None:
 
 @jit
 def play_step(state: float, v: float, half: float) -> float:
-    """Return where the plug stands after the position became ``v``; NaN is a plug not seen yet."""
+    """Return the plug position after the measured one became ``v``; NaN before the first row."""
     return v if np.isnan(state) else min(max(state, v - half), v + half)
 
 
 @jit
 def slip_step(state: float, v: float, off: float, near: float) -> float:
-    """Return where a sticking plug stands: it slips to ``near`` when pulled by ``off``."""
+    """Return the position of a sticking plug: beyond a distance ``off`` it slips to ``near``."""
     pull = v - state
     if pull > off:
         state = v - near
@@ -119,13 +119,13 @@ def slip_step(state: float, v: float, off: float, near: float) -> float:
 
 @jit
 def rate_step(state: float, v: float, largest: float) -> float:
-    """Return where a slow plug stands that moves by at most ``largest``."""
+    """Return the position of a slow plug that moves by at most ``largest``."""
     return v if np.isnan(state) else state + min(max(v - state, -largest), largest)
 
 
 @jit
 def play(v: FloatArray, half: float, out: FloatArray) -> None:
-    """Follow ``v`` only where one flank of a slack of width ``2 half`` pushes; NaN is passed."""
+    """Follow ``v`` through a backlash of width ``2 half``; NaN stays NaN."""
     state = np.nan
     for t in range(v.size):
         if np.isnan(v[t]):
@@ -137,7 +137,7 @@ def play(v: FloatArray, half: float, out: FloatArray) -> None:
 
 @jit
 def stick_slip(v: FloatArray, band: float, jump: float, out: FloatArray) -> None:
-    """Stay until the pull exceeds (S + J)/2, then slip to (S - J)/2 from it."""
+    """Stay until the distance exceeds (S + J)/2, then slip to (S - J)/2 from ``v``."""
     state = np.nan
     off, near = 0.5 * (band + jump), 0.5 * (band - jump)
     for t in range(v.size):
@@ -152,7 +152,7 @@ def stick_slip(v: FloatArray, band: float, jump: float, out: FloatArray) -> None
 
 @jit
 def rate_limit(v: FloatArray, largest: float, out: FloatArray) -> None:
-    """Follow ``v`` by at most ``largest`` a row."""
+    """Follow ``v`` by at most ``largest`` per row."""
     state = np.nan
     for t in range(v.size):
         if np.isnan(v[t]):
@@ -164,7 +164,7 @@ def rate_limit(v: FloatArray, largest: float, out: FloatArray) -> None:
 
 @jit
 def viterbi(cost_on: FloatArray, penalty: float, out: ByteArray) -> None:
-    """Write the path of two states with least cost; ``cost_on`` (n,) is on minus off."""
+    """Write the two-state path of least cost; ``cost_on`` (n,) is the cost of on minus off."""
     n = cost_on.size
     back = np.empty((n, 2), dtype=np.uint8)
     off, on = 0.0, penalty
@@ -181,10 +181,10 @@ def viterbi(cost_on: FloatArray, penalty: float, out: ByteArray) -> None:
         state = back[t, state]
 
 
-# The loops of the extended model row by row, with what is remembered between blocks.
+# The loops of the extended model for streams, with a state between blocks of rows.
 #
-# States are arrays that the caller owns and the loops write. ``begin`` says of every row how it
-# follows the one before: `GOES_ON`, `ANEW` after a gap, or `NO_DATA`.
+# States are arrays that the caller owns and the loops update. ``begin`` gives the state of every
+# row: `GOES_ON` after the previous one, `ANEW` after a gap, or `NO_DATA`.
 
 GOES_ON, ANEW, NO_DATA = 0, 1, 2
 AGE, PLACE = 0, 1
@@ -195,9 +195,9 @@ def beginnings(
     time_ns: IntArray, u: FloatArray, gap_ns: int, state: IntArray, jumps: ByteArray,
     begin: ByteArray,
 ) -> None:  # fmt: skip
-    """Write where time jumps, and how each row follows the one before.
+    """Write where the time jumps, and whether each row continues the previous one.
 
-    ``state`` holds the time of the last row and how that one began.
+    ``state`` holds the time and the ``begin`` value of the last row.
     """
     for t in range(time_ns.size):
         step = time_ns[t] - state[0]
@@ -221,10 +221,10 @@ def respond_block(
     past: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Filter the flow by the taps of the region each row lies in; a gap begins in equilibrium.
+    """Filter the flow with the taps of the region of each row; a gap starts in equilibrium.
 
-    ``past`` is a ring of flows, ``place`` the rows since the gap and the place in the ring,
-    ``answer`` (1,) the filter's state.
+    ``past`` is a ring buffer of flows. ``place`` holds the rows since the gap and the index in the
+    ring buffer. ``answer`` (1,) is the filter state.
     """
     room = past.size
     for t in range(x.size):
@@ -247,7 +247,7 @@ def delay(
     y: FloatArray, jumps: ByteArray, whole: int, part: float, place: IntArray, past: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Write what a series was ``whole + part`` rows ago, NaN where that is not known."""
+    """Write the value of a series ``whole + part`` rows ago, NaN if unknown."""
     room = past.size
     for t in range(y.size):
         if jumps[t]:
@@ -266,7 +266,7 @@ def delay(
 
 @jit
 def play_block(v: FloatArray, half: float, state: FloatArray, out: FloatArray) -> None:
-    """Follow ``v`` only where one flank of a slack pushes; NaN is passed."""
+    """Follow ``v`` through a backlash of width ``2 half``; NaN stays NaN."""
     for t in range(v.size):
         out[t] = np.nan
         if not np.isnan(v[t]):
@@ -278,7 +278,7 @@ def rate_limit_block(
     v: FloatArray, time_ns: IntArray, rate_per_s: float, state: FloatArray, last_ns: IntArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Follow ``v`` at no more than a rate; through a gap the plug moves on unseen."""
+    """Follow ``v`` at a limited rate; the plug continues to move during a gap."""
     for t in range(v.size):
         out[t] = np.nan
         if not np.isnan(v[t]):
@@ -291,7 +291,7 @@ def rate_limit_block(
 def stick_slip_block(
     v: FloatArray, noise: FloatArray, band: float, jump: float, state: FloatArray, out: FloatArray
 ) -> None:
-    """Write the mean place of plugs that each feel the position with a noise of their own.
+    """Write the mean position of several plugs, each with its own noise of the position.
 
     ``noise`` is (n, draws), ``state`` (draws,).
     """
@@ -311,7 +311,7 @@ def stick_slip_block(
 
 @jit
 def filled(x: FloatArray, last: FloatArray, out: FloatArray) -> None:
-    """Write a series in which the last value stands for a missing one; ``last`` is (1,)."""
+    """Write a series with missing values replaced by the last value; ``last`` is (1,)."""
     for t in range(x.size):
         if not np.isnan(x[t]):
             last[0] = x[t]

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of the record itself: they have a name and are masked, but no model explains them."""
+"""Faults of the record itself: they are named and masked, but not modelled."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from valveflow_ros.records import SIGNALS, BoolArray, FloatArray, SampleTable, S
 FLAT_LEAST_S = 30.0
 _FLAT_FACTOR = 3.0
 _LARGEST_SHARE = 0.5
-_LARGEST = 0.999  # quantile of an opening; beyond may lie a spike
+_LARGEST = 0.999  # quantile of an opening; larger values may be spikes
 _SPIKE_WINDOW, _SPIKE_SD, _LONGEST_SPIKE = 11, 6.0, 1
 _SPIKE_SHARE, _LEAST_SPIKES, _LEAST_HEIGHT = 0.01, 4, 0.01
 _NOISE_ROWS = 3600
@@ -34,9 +34,9 @@ class Fault:
         'flatline', 'spikes' or 'quantisation'.
     signal : SignalInfo
     rows : int
-        Rows that are masked; of a coarse signal, rows that do not change.
+        Number of masked rows; for quantisation, rows without a change.
     size : float
-        Longest flat stretch in seconds, typical height of spikes, or the step.
+        Longest constant stretch in seconds, typical height of spikes, or the step.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Fault:
 
     @property
     def sentence(self) -> str:
-        """Say it to an operator."""
+        """Return a sentence for an operator."""
         what = self.signal.topic
         if self.name == 'flatline':
             return (
@@ -66,20 +66,20 @@ class Fault:
 
 
 def _runs(x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first row and the length of runs of equal values; NaN equals nothing."""
+    """Return the first row and the length of runs of equal values; NaN never equals NaN."""
     first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
     return first, np.diff(np.append(first, len(x)))
 
 
 def _at_stop(x: FloatArray) -> BoolArray:
-    """Return where a valve stands at a stop: shut, open, or as far open as it ever is."""
+    """Return where a valve is at a stop: shut, fully open, or at its largest opening."""
     return np.asarray((x <= 0.0) | (x >= 100.0) | (x >= np.nanquantile(x, _LARGEST)))
 
 
 def _flat(x: FloatArray, step_s: float, rests: BoolArray | None = None) -> tuple[BoolArray, float]:
-    """Return rows inside runs far longer than this signal's usual ones.
+    """Return rows in runs that are much longer than usual for this signal.
 
-    ``rests`` are rows in which it may stand still.
+    ``rests`` are rows in which the signal may be constant.
     """
     first, length = _runs(x)
     bad = np.zeros(len(x), dtype=bool)
@@ -91,19 +91,19 @@ def _flat(x: FloatArray, step_s: float, rests: BoolArray | None = None) -> tuple
     if length[long].sum() > _LARGEST_SHARE * len(x):
         return bad, 0.0
     for a, n in zip(first[long], length[long], strict=True):
-        bad[a + 1 : a + n] = True  # the first value was true when it was written
+        bad[a + 1 : a + n] = True  # the first value was correct when it was written
     return bad, float(length[long].max(initial=0)) * step_s
 
 
 def _returns(x: FloatArray, a: int, b: int) -> bool:
-    """Tell whether a signal leaps at row ``a`` and is back at row ``b`` all at once.
+    """Return True if a signal jumps at row ``a`` and jumps back at row ``b``.
 
-    A fast move does not come back, and the peak of a lively signal is not reached in one row.
+    A fast move does not return, and the peak of a varying signal is not reached in one row.
     """
     if a == 0 or b >= len(x):
         return False
     near = x[max(0, a - _LEAP_ROWS) : b + _LEAP_ROWS]
-    # Of the livelier rows: a valve that leans on its stop stands still for half of them.
+    # A high quantile, not the median: a valve at its stop is constant in half of the rows.
     usual = float(np.nanquantile(np.abs(np.diff(near)), 0.98)) / 2.326
     there, back = x[a] - x[a - 1], x[b] - x[b - 1]
     abrupt = there * back < 0.0 and min(abs(there), abs(back)) > _LEAP_SD * usual
@@ -130,8 +130,8 @@ def _spikes(x: FloatArray) -> tuple[BoolArray, float]:
     if not _LEAST_SPIKES <= bad.sum() <= _SPIKE_SHARE * len(x):
         return np.zeros(len(x), dtype=bool), 0.0
     height = float(np.median(size[bad]))
-    # The livelier a governor the more of its moves come back in a row; a converter that slips
-    # shows values far from where the signal is.
+    # With an active governor many moves return within a row; spikes of a faulty converter are
+    # much larger than the range of such moves.
     low, high = np.quantile(x[good], (0.01, 0.99))
     if not height > _LEAST_HEIGHT * (high - low):
         return np.zeros(len(x), dtype=bool), 0.0
@@ -139,7 +139,7 @@ def _spikes(x: FloatArray) -> tuple[BoolArray, float]:
 
 
 def _coarse(x: FloatArray) -> tuple[int, float]:
-    """Return how many rows do not change and the step of a coarse record; 0 if it is fine."""
+    """Return the number of constant rows and the step of a coarse record; 0 if it is fine."""
     x = x[np.isfinite(x)]
     if len(x) < 100:
         return 0, 0.0
@@ -150,14 +150,14 @@ def _coarse(x: FloatArray) -> tuple[int, float]:
     values = np.unique(x)
     step = float(np.median(np.diff(values)))
     moved = float(np.median(change[change > 0.0]))
-    # Steps of one unit of the record are what makes it coarse; large ones are a resting valve.
+    # Steps of one unit mean a coarse record; larger steps mean a valve at rest.
     return (still, step) if moved < 2.0 * step else (0, 0.0)
 
 
 def faults(
     table: SampleTable, step_s: float, held: bool = False
 ) -> tuple[BoolArray, tuple[Fault, ...]]:
-    """Look for faults in every signal.
+    """Search for faults in every signal.
 
     Parameters
     ----------
@@ -165,12 +165,12 @@ def faults(
     step_s : float
         Step of its rows.
     held : bool
-        The log was compressed: values that stand still, and steps of the dead band, are no faults.
+        The log was compressed: constant values and steps of the dead band are not faults.
 
     Returns
     -------
     bad : bool (rows, 5)
-        Values that are not to be believed.
+        Invalid values.
     found : tuple of Fault
     """
     bad = np.zeros(table.values.shape, dtype=bool)
@@ -181,7 +181,7 @@ def faults(
             continue
         still, step = (0, 0.0) if held else _coarse(x)
         wild, height = _spikes(x)
-        # A coarse signal stands still all the time; that is named already.
+        # A coarse signal is often constant; that is already reported.
         flat, longest = np.zeros(len(x), dtype=bool), 0.0
         if not still and not held:
             rests = _at_stop(x) if info.signal == Signal.VALVE_OPENING else None

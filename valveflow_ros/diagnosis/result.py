@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The diagnosis as a record: verdict, causes, proof."""
+"""The diagnosis as a record: verdict, causes, evidence."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ NAMED, NOTHING, UNEXPLAINED = 'named', 'nothing', 'unexplained'
 
 @dataclass(frozen=True, slots=True)
 class NamedCause:
-    """A cause with its parameters and what it is worth on sealed blocks.
+    """A cause with its parameters and its gain on the sealed (test) blocks.
 
-    ``meaning`` says how many MW it is at full load, empty where that is not known.
+    ``meaning`` gives the effect in MW at full load; empty if unknown.
     """
 
     name: str
@@ -59,7 +59,7 @@ class NamedCause:
 
     @property
     def to_do(self) -> str:
-        """Return what an operator does about it; empty for a covariate."""
+        """Return the action for the operator; empty for a covariate."""
         told = TO_DO.get(self.name, '')
         for name, e in self.parameters.items():
             told = told.replace(f'`{name}`', f'{name} = {e.value:.4g} {e.unit}'.rstrip())
@@ -68,17 +68,17 @@ class NamedCause:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A slow wander that is no cause.
+    """A slow disturbance of the power that is not a cause.
 
     Attributes
     ----------
     rms_mw, time_scale_s : float
-        Its root mean square, and the time over which it changes.
+        Its root mean square and its time scale.
     drift_mw : float or None
-        Of a wander over many hours and days the root mean square about its mean over the
-        record; see `slow.drift`.
+        Root mean square about its mean over the record, for a disturbance over many hours
+        and days; see `slow.drift`.
     shape : str
-        Words for the shape of the change in time, where it has one; see `slow.courses`.
+        Description of the shape of the change in time, if it has one; see `slow.courses`.
     """
 
     rms_mw: float
@@ -104,12 +104,12 @@ class Disturbance:
         )
 
 
-_DAYS_FROM_H = 8.0  # a wander of so long a memory is seen to go on from day to day
+_DAYS_FROM_H = 8.0  # a disturbance with a longer memory continues from day to day
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the simulation gets wrong, why, and what the extended model is worth.
+    """The errors of the simulation, their causes and the gain of the extended model.
 
     Attributes
     ----------
@@ -120,21 +120,21 @@ class Diagnosis:
     causes : tuple of NamedCause
         In the order found; faults of the record come last.
     not_told_apart : tuple of str
-        Causes these data cannot tell from the ones named.
+        Causes that these data cannot distinguish from the named ones.
     experiments : tuple of str
-        What would tell them apart.
+        Experiments that would distinguish them.
     disturbance : Disturbance or None
     unexplained_by : tuple of str
     rejected : tuple of (name, reason)
     rmse_simulation, rmse_extended, rmse_noise_floor : float
-        MW, on sealed blocks, of means over ``mean_s``.
+        MW, RMSE on sealed blocks of means over ``mean_s``.
     segments : tuple of SegmentGain
     simulation, extended : Extended
         Without and with causes, fitted to the open blocks.
     final : Extended
-        With causes, fitted to everything: the model to go on with.
+        With causes, fitted to all blocks: the model for further use.
     reference : Reference
-        What its causes count from.
+        Reference values of its causes.
     notes : tuple of str
     mean_s : float
     """
@@ -159,7 +159,7 @@ class Diagnosis:
     mean_s: float = MEAN_S
 
     def measured_in(self, unit: str) -> Diagnosis:
-        """Return the same numbers as those of an output in ``unit``, and sentences that say so."""
+        """Return the same numbers and sentences in ``unit`` of the output."""
         causes = tuple(
             dataclasses.replace(
                 c, sentence=in_unit(c.sentence, unit), experiment=in_unit(c.experiment, unit),
@@ -179,12 +179,12 @@ class Diagnosis:
         )  # fmt: skip
 
 
-# The extended model as JSON: what ``extended_model.json`` holds, and what is believed of one.
+# The extended model as JSON: content and validation of ``extended_model.json``.
 
 MODEL_FORMAT, MODEL_VERSION = 'valveflow/extended_model', 2
-# Version 1 counted these from their mean over the record, with another curve therefore.
+# Version 1 used the mean over the record as their origin, hence another curve.
 _COUNTED_OTHERWISE = ('curve_step', 'gain_step', 'input_step')
-_MOST_MODELS = 10  # on top of one another
+_MOST_MODELS = 10  # largest number of models on top of each other
 _WHOLE = 'extended model'
 
 
@@ -218,7 +218,7 @@ def model_to_json(given: ExtendedModel) -> dict[str, Any]:
 
 
 def _form_json(given: ExtendedModel) -> dict[str, Any]:
-    """Return the form under its keys; a model of the paper's has none of them."""
+    """Return the entries for the form; none for the form of the paper."""
     if not given.form.scaled:
         return {}
     return {
@@ -235,11 +235,11 @@ def _covariate_json(about: Covariate) -> dict[str, Any]:
 
 
 def is_model(raw: object) -> bool:
-    """Tell whether JSON says of itself that it is an extended model."""
+    """Return True if the JSON declares itself an extended model."""
     return isinstance(raw, dict) and raw.get('format') == MODEL_FORMAT
 
 
-_TIME = Number(-4e7, 4e7)  # seconds from the model's start, 400 days and more
+_TIME = Number(-4e7, 4e7)  # seconds from the start of the model, more than 400 days
 _SCHEMA = {
     'output_unit': OUTPUT_UNIT,
     'axis': Maybe(Text(AXES)),
@@ -279,7 +279,7 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
     Raises
     ------
     DataError
-        It is none, or not one this version can use; the sentence names the place.
+        The content is invalid or not supported by this version; the message names the entry.
     """
     path = '.'.join(['on_top_of'] * depth)
     inside = f'{path}.' if path else ''
@@ -315,7 +315,7 @@ def model_from_json(raw: object, depth: int = 0) -> ExtendedModel:
 
 
 def _base(top: dict[str, Any], inside: str) -> RegionalModel:
-    """Return curve and dynamics, and refuse what could not be run."""
+    """Return curve and dynamics; raise if they cannot be simulated."""
     knots, left, right = (np.array(top['curve'][k]) for k in ('knots', 'left', 'right'))
     if not len(left) == len(right) == len(knots) - 1 >= 1:
         problem = 'must have one knot more than values at left and right ends'
@@ -360,12 +360,12 @@ FORMAT, VERSION = 'valveflow/diagnosis', 1
 
 
 def _number(value: float) -> float | None:
-    """JSON has neither NaN nor infinity: absent is null."""
+    """Return None for NaN and infinity, which JSON does not have."""
     return float(value) if math.isfinite(value) else None
 
 
 def cause_json(c: NamedCause) -> dict[str, Any]:
-    """Return a cause; its parameters stay numbers, a time says what it counts from."""
+    """Return a cause; its parameters are numbers, and a time includes its origin."""
     return {
         'name': c.name,
         'sentence': c.sentence,

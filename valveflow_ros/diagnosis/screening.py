@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Screening: what a model leaves unexplained, and cheap ways to try a cause on it.
+"""Screening: the unexplained residual of a model, and fast tests of causes on it.
 
-All tries are regressions of the whitened residual on whitened columns, freed of what curve,
-dynamics and the causes found so far could take up themselves. Products of columns are summed
-once over sub-blocks of half an hour; a change at any moment, a drift or a daily wave is then a
-weighting of these sums, and needs no further pass over the data.
+All tests regress the whitened residual on whitened columns, after removing what curve, dynamics
+and the causes found so far could explain. Products of columns are summed once over sub-blocks of
+half an hour. A step at any time, a drift or a daily cycle is then a weighted sum of these
+products, without another pass over the data.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from valveflow_ros.diagnosis.fitting import (
 from valveflow_ros.diagnosis.grids import DAY_S, Grids
 from valveflow_ros.records import FloatArray
 
-# What the model could explain itself, to be taken away before a cause is judged.
+# The part that the model itself could explain; it is removed before a cause is judged.
 
 
 def nuisance(task: Task, model: Extended) -> FloatArray:
-    """Return whitened tangents of everything the model could move itself, columns scaled to 1.
+    """Return whitened tangents of all free parameters of the model, columns scaled to 1.
 
-    A delay at its bound 0 cannot move down and is left out: it would swallow a clock offset.
+    A delay at its bound 0 cannot decrease and is left out: it would absorb a clock offset.
     """
     free = np.flatnonzero(base_mask(task, model))
     base = base_tangents(task, model)
@@ -54,20 +54,20 @@ def nuisance(task: Task, model: Extended) -> FloatArray:
 HATS = 13
 _SECANT = 0.004
 _EDGE_SHARE = 0.04
-GAIN, INPUT, OFFSET, CURVE = 0, 1, 2, 3  # carriers; the hats of the curve begin at CURVE
+GAIN, INPUT, OFFSET, CURVE = 0, 1, 2, 3  # carriers (basic effects); the curve has HATS of them
 
 
 class Screening:
-    """The unexplained residual of one model, ready for causes to be tried on it.
+    """The unexplained residual of one model, prepared for tests of causes.
 
     Parameters
     ----------
     task : Task
     model : Extended
-        At its optimum.
+        The fitted model.
     rough : Grids, optional
-        The record with longer model rows; what a cause would change is computed on them, the
-        residual it has to explain is that of the task.
+        The record with longer model rows; the effect of a cause is computed on them, and the
+        residual is that of the task.
     """
 
     def __init__(self, task: Task, model: Extended, rough: Grids | None = None) -> None:
@@ -114,7 +114,7 @@ class Screening:
     def _linear(
         self, driven: Drive, x: FloatArray, path: np.ndarray, change: FloatArray
     ) -> FloatArray:
-        """Return the answer to a small change of the flow, regions held."""
+        """Return the response to a small change of the flow, with fixed regions."""
         gain = 1.0 if driven.gain is None else driven.gain
         added = change / gain if driven.added is None else driven.added + change / gain
         moved = answer(self.grids, self.model, replace(driven, added=added), path)
@@ -123,10 +123,10 @@ class Screening:
 
     @property
     def sums(self) -> FloatArray:
-        """Return products summed over sub-blocks of (carriers freed of the rest, residual).
+        """Return products of the columns (tangents, carriers, residual), summed over sub-blocks.
 
-        Shape (subs, 4 + HATS, 4 + HATS); sealed sub-blocks are zero. Carriers are *not* freed
-        of nuisance here, since a weighting in time would undo that; see `modulated`.
+        Shape (subs, P + 4 + HATS, P + 4 + HATS) with P tangents; sealed sub-blocks are zero. The
+        tangents are *not* removed from the carriers here, but after weighting; see `modulated`.
         """
         if self._sums is None:
             carriers = self.task.innovations(self.carriers())
@@ -139,14 +139,14 @@ class Screening:
         return self._sums
 
     def modulated(self, which: list[int], weights: FloatArray) -> tuple[float, FloatArray]:
-        """Return the log-likelihood gained by carriers times functions of time, and coefficients.
+        """Return the log-likelihood gain of carriers times functions of time, and coefficients.
 
         Parameters
         ----------
         which : list of int, length k
             Carriers.
         weights : float64 (k, subs)
-            What each is multiplied by in each sub-block.
+            Factor of each carrier in each sub-block.
         """
         p = self.n.shape[1]
         at = [p + c for c in which]
@@ -163,7 +163,7 @@ class Screening:
         Parameters
         ----------
         shapes : float64 (k, 3 + HATS)
-            Each a combination of carriers that sets in.
+            Each row is a combination of carriers that begins at the onset.
         """
         p, c = self.n.shape[1], 3 + HATS
         after = np.cumsum(self.sums[::-1], axis=0)[::-1]
@@ -180,7 +180,7 @@ class Screening:
         return gains, found
 
     def displaced(self, cause: Cause, values: Values, extra: Values = ()) -> Start:
-        """Run the model with a cause of given size and return what that is worth."""
+        """Simulate the model with a cause of given size and return its gain."""
         model = self.model.with_cause(Active(cause, cause.clipped(values), extra))
         change = self.task.innovations(self._explained(model))
         left = self.rest - change
@@ -189,20 +189,20 @@ class Screening:
         return Start(cause.clipped(values), (self.floor - cost) / (2.0 * self.variance), extra)
 
     def _explained(self, model: Extended) -> FloatArray:
-        """Return by how much a cause more moves the prediction in MW, shape (m,)."""
+        """Return the change of the prediction by one more cause in MW, shape (m,)."""
         if not model.active[-1].cause.draws:
             return answer(self.grids, model) - self.here
         return self.grids.power - self.here - self.task.residual(model)
 
     def best(self, cause: Cause, grid: list[Values], keep: int = 1) -> list[Start]:
-        """Return the best of some values."""
+        """Return the starts with the largest gain."""
         tried = sorted((self.displaced(cause, v) for v in grid), key=lambda s: -s.gain)
         return [s for s in tried[:keep] if s.gain > 0.0]
 
     def scaled(self, cause: Cause, unit: Values) -> list[Start]:
-        """Return the start of a cause of one parameter, from its secant at two small values.
+        """Return the start of a cause with one parameter, from its effect at two small values.
 
-        The size is found by regression on the displacement, then tried as it is.
+        The size is estimated by regression on that effect, then simulated.
         """
         (size,) = unit
         tried = []
@@ -216,11 +216,11 @@ class Screening:
         return sorted(good, key=lambda s: -s.gain)[:1]
 
     def only(self, carrier: int) -> FloatArray:
-        """Return the shape that is one carrier alone, (1, 3 + HATS)."""
+        """Return the shape that consists of one carrier, (1, 3 + HATS)."""
         return np.eye(3 + HATS)[[carrier]]
 
     def best_onset(self, cause: Cause, shape: FloatArray) -> list[Start]:
-        """Return the best start of a cause (size, onset) that sets in at some half hour."""
+        """Return the best start of a cause (size, onset) over onsets at every half hour."""
         gains, found = self.onsets(shape)
         sub = int(np.argmax(gains[:, 0]))
         size = float(found[sub, 0])
@@ -236,10 +236,10 @@ class Screening:
         return float(np.searchsorted(self.grids.sub, sub)) * self.grids.mean_s
 
     def gain_by_sub(self) -> tuple[FloatArray, FloatArray]:
-        """Return, by sub-block, the square of the gain's column and its product with the rest.
+        """Return, by sub-block, the square of the gain column and its product with the residual.
 
-        The column is not freed of what the model can do: over the whole record the curve is
-        the gain, and nothing would be left.
+        The tangents are not removed from the column: over the whole record the curve could explain
+        all of the gain, and nothing would remain.
         """
         p = self.n.shape[1]
         return self.sums[:, p + GAIN, p + GAIN], self.sums[:, p + GAIN, -1]

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which causes: screening, rivals, full refits, a penalised choice, one after the other."""
+"""Selection of causes: screening, refits of the candidates, a penalised choice, one by one."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from valveflow_ros.records import FloatArray
 
 # The plain simulation: few distinct pieces.
 #
-# A curve found by prediction error has as many knees as pay. A shallow one is no valve point
-# but part of a shape, and would hide `curve_shape` inside the model.
+# A curve found by prediction error has as many breakpoints as reduce the error. A shallow one is
+# not a valve point but part of a smooth shape, and would hide `curve_shape` inside the model.
 
 SHALLOW = 0.2  # change of slope relative to the larger one
 _JUMP = 1e-4  # of the range of the curve, whose unit depends on the form
 
 
 def simplified(model: RegionalModel) -> RegionalModel:
-    """Return the curve without its shallow knees, the shallowest first; jumps stay."""
+    """Return the curve without its shallow breakpoints, removed one by one; jumps stay."""
     least = _JUMP * float(np.ptp(np.concatenate([model.left, model.right])))
     while model.pieces > 1:
         slopes = model.slopes()
@@ -55,7 +55,7 @@ def simplified(model: RegionalModel) -> RegionalModel:
 
 
 def without_knot(model: RegionalModel, knot: int) -> RegionalModel:
-    """Return the curve with the two pieces at an inner knot made one."""
+    """Return the curve with the two pieces at an inner breakpoint merged."""
     return replace(
         model,
         knots=np.delete(model.knots, knot),
@@ -64,18 +64,18 @@ def without_knot(model: RegionalModel, knot: int) -> RegionalModel:
     )
 
 
-# Knees of the plain curve that are no valve points but the middle of a bump.
+# Breakpoints of the plain curve that are not valve points but the middle of a bump.
 #
-# A curve found by prediction error puts a knee wherever one pays, in the middle of a bump too,
-# and `curve_shape` would find nothing left. Such a knee bends the other way than both its
-# neighbours. It is given up where a bump in its place does as well.
+# A curve found by prediction error may have a breakpoint in the middle of a bump, and
+# `curve_shape` would find nothing. Such a breakpoint bends in the opposite direction to both
+# neighbours. It is removed if a bump in its place explains the data equally well.
 
-_WIDTHS = (0.5, 0.8, 1.2)  # of the shorter piece beside the knee
+_WIDTHS = (0.5, 0.8, 1.2)  # of the shorter piece next to the breakpoint
 _PLACES = (-0.15, 0.0, 0.15)
 
 
 def without_bumps(task: Task, plain: Extended) -> tuple[Task, Extended]:
-    """Return the plain model without knees that a bump would replace, fitted again."""
+    """Return the plain model without breakpoints that a bump can replace, fitted again."""
     for knot in _suspects(plain):
         smaller = replace(plain, base=simplified(without_knot(plain.base, knot)))
         if _as_good(task, plain, smaller, float(plain.base.knots[knot]), _width(plain, knot)):
@@ -85,7 +85,7 @@ def without_bumps(task: Task, plain: Extended) -> tuple[Task, Extended]:
 
 
 def _suspects(plain: Extended) -> list[int]:
-    """Return inner knots that bend against both neighbours."""
+    """Return inner breakpoints that bend in the opposite direction to both neighbours."""
     bend = np.sign(np.diff(plain.base.slopes()))
     return [
         k + 1 for k in range(1, len(bend) - 1) if bend[k] == -bend[k - 1] == -bend[k + 1] != 0.0
@@ -98,7 +98,7 @@ def _width(plain: Extended, knot: int) -> float:
 
 
 def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: float) -> bool:
-    """Tell whether a bump at ``u`` brings the smaller model to the cost of the plain one."""
+    """Return True if a bump at ``u`` reduces the cost of the smaller model to the plain one."""
     screening, cause = Screening(task, smaller), catalogue()['curve_shape']
     gain = max(
         screening.scaled_height(cause, (u + place * width, share * width)).gain
@@ -108,18 +108,18 @@ def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: fl
     return screening.floor - 2.0 * screening.variance * gain <= task.cost(plain)
 
 
-# Curve and regions found anew behind a strong cause.
+# New identification of curve and regions after a strong cause.
 #
-# A cause that moves the power by as much as the noise leads the identification astray: regions
-# are missed, knees are put where none is. Seen through the cause, the record is that of the
-# plant without it, and pieces and regions are searched for again as in an identification.
+# A cause as large as the noise of the power makes the identification wrong: regions are missed
+# and breakpoints are misplaced. After correcting for the cause, the record is that of the plant
+# without it, and pieces and regions are identified again.
 
 _MORE_PIECES, _MOST = 3, 8
-_EACH = 5.0  # log-likelihood that each number more of curve and regions must bring
+_EACH = 5.0  # log-likelihood that each additional parameter of curve and regions must gain
 
 
 def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
-    """Return the model on a curve and regions of its own if they do better, else as it is."""
+    """Return the model with newly identified curve and regions if they fit better."""
     try:
         found, _ = search_plain(_seen_through(task, model), _rich(model.base), _MOST)
         base = simplified(found)
@@ -128,7 +128,7 @@ def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
     if base.pieces == model.base.pieces and base.regions == model.base.regions:
         return task, model
     task_new, other, cost = settle(task, replace(model, base=base), rounds=1, steps=4)
-    # Both under one whitening: the better model's.
+    # Both with the whitening of the better model.
     variance = cost / max(int(task.rows.sum()), 1)
     before = task_new.cost(model) / (2.0 * variance) + _EACH * model.base.size
     after = task_new.cost(other) / (2.0 * variance) + _EACH * other.base.size
@@ -136,7 +136,7 @@ def rebuilt(task: Task, model: Extended) -> tuple[Task, Extended]:
 
 
 def _seen_through(task: Task, model: Extended) -> Samples:
-    """Return the record as it would be without the causes; sealed blocks are left out."""
+    """Return the record corrected for the causes; sealed blocks are left out."""
     grids = task.grids
     driven = drive(grids, model)
     plain = answer(grids, model.without_causes(), Drive(driven.u, driven.scale, None, None))
@@ -154,7 +154,7 @@ def _seen_through(task: Task, model: Extended) -> Samples:
 
 
 def _rich(base: RegionalModel) -> RegionalModel:
-    """Return the curve with its widest pieces cut in two, to be pruned."""
+    """Return the curve with its widest pieces split in two; superfluous ones are removed later."""
     for _ in range(_MORE_PIECES):
         k = int(np.argmax(np.diff(base.knots)))
         middle = 0.5 * (base.knots[k] + base.knots[k + 1])
@@ -168,21 +168,21 @@ def _rich(base: RegionalModel) -> RegionalModel:
     return base
 
 
-# A bump, or a dent beside it.
+# A bump, or a dent next to it.
 #
-# With its knees free a curve with a bump equals one with other knees and a dent beside, but for
-# little. So a named bend is held against such ones of the other sign, each with knees of its own.
+# With free breakpoints, a curve with a bump is nearly equal to one with other breakpoints and a
+# dent next to it. So a named bend is compared with bends of the other sign, each refitted.
 
 _BESIDE = (-1.2, -0.7, 0.7, 1.2)  # of its half width
 _SIGN_TOLD = 10.0  # log-likelihood by which one sign must be better than the other
-_LEAST_BEND = 0.1  # of the height of the named one: less is none
+_LEAST_BEND = 0.1  # of the height of the named one: smaller bends are ignored
 
 
 def other_bend(found: Found) -> Extended | None:
-    """Give `curve_shape` the better sign; return the model of the other if it does nearly as well.
+    """Give `curve_shape` the better sign; return the other model if it fits nearly as well.
 
-    Both are settled alike and compared under the whitening of the better one; each number of the
-    curve is paid for.
+    Both are fitted in the same way and compared with the whitening of the better one; each
+    parameter of the curve is penalised.
     """
     bend = _bend(found.model)
     if bend is None:
@@ -212,7 +212,7 @@ def other_bend(found: Found) -> Extended | None:
 
 
 def _advantage(task: Task, model: Extended, other: Extended) -> float:
-    """Return the log-likelihood by which a model is better than another, under its whitening."""
+    """Return the log-likelihood of a model minus that of another, with one whitening."""
     e = task.innovations(task.residual(model))
     variance = float(e @ e) / len(e) * colour(task, e)
     gain = (task.cost(other) - task.cost(model)) / (2.0 * variance)
@@ -220,7 +220,7 @@ def _advantage(task: Task, model: Extended, other: Extended) -> float:
 
 
 def _settled_anew(task: Task, model: Extended) -> tuple[Task, Extended]:
-    """Return the model fitted again on a curve and regions of its own."""
+    """Return the model fitted again with newly identified curve and regions."""
     if not task.fixed_dynamics:
         base, _ = search_plain(_seen_through(task, model), _rich(model.base), _MOST)
         model = replace(model, base=simplified(base))
@@ -232,7 +232,7 @@ def _bend(model: Extended) -> Active | None:
 
 
 def _turned(model: Extended, h: float) -> bool:
-    """Tell whether the bend of a model has the other sign than ``h``, on the curve."""
+    """Return True if the bend has the opposite sign to ``h`` and lies on the curve."""
     bend = _bend(model)
     if bend is None:
         return False
@@ -246,18 +246,18 @@ Progress = Callable[[float, str], None]
 _OF_FORM = {'exponent': 'the exponent', 'curve_shape': 'the curve'}
 MOST_CAUSES = 4
 MOST_RIVALS = 7
-PENALTY = 5.0  # log-likelihood that each number chosen from the data must bring
+PENALTY = 5.0  # log-likelihood that each parameter chosen from the data must gain
 SCREEN_LEAST = 6.0
 SCREEN_SHARE = 0.1
 NOT_TOLD_APART = 10.0
 KEPT_LEAST = 8.0
-STRONG = 300.0  # log-likelihood of a cause that may have led the identification astray
+STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
 _SHORT_STEPS_MW = (1.0, 0.4)
 
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """A cause after its full refit; ``score`` is half a penalised sum of squares."""
+    """A candidate cause after a full refit; ``score`` is half a penalised sum of squares."""
 
     model: Extended
     added: Active
@@ -275,17 +275,17 @@ class Found:
     plain : Extended
         The model without causes, fitted to the same rows.
     evidence : dict
-        By name of a cause, what spoke for it when it was taken.
+        By name of a cause, its evidence when it was added.
     near : dict
-        By name of a cause, the rivals that did nearly as well.
+        By name of a cause, the other candidates that fitted nearly as well.
     reasons : dict
-        By name, why a cause was put away.
+        By name, why a cause was rejected.
     tried : int
         Number of causes tried.
     rough : Grids, optional
         The record with longer model rows, for screening.
     other_bend : Extended, optional
-        The model with the other one, where `curve_shape` may be a bump or a dent.
+        The model with the opposite sign, if `curve_shape` may be a bump or a dent.
     """
 
     task: Task
@@ -303,7 +303,7 @@ _BY_CHANCE = 'the power does not follow it more closely than a slow wander would
 
 
 def search(task: Task, start: Extended, progress: Progress, rough: Grids | None = None) -> Found:
-    """Fit the plain model, then add causes while one of them stands up to all tests."""
+    """Fit the plain model, then add causes while one of them passes all tests."""
     progress(0.05, 'simulation fitted to the record')
     task, plain, _ = settle(task, start, rounds=2, steps=4)
     task, plain = without_bumps(task, plain)
@@ -315,8 +315,8 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
             found.reasons[name] = f'cannot be judged: {why}'
             barred.add(name)
     if task.grids.form.scaled:
-        # They were found with the form, in this record or in that of the model given: one is its
-        # number, the other what straight pieces leave of valves in sequence.
+        # They were determined together with the form, in this record or that of the given model:
+        # the exponent is a parameter of it, and the curve shape is the error of straight pieces.
         for name, what in _OF_FORM.items():
             found.reasons[name] = (
                 f'cannot be judged: {what} of p^m F(V) + c was itself found from a record'
@@ -339,7 +339,7 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
 
 
 def _conceal(found: Found, barred: set[str]) -> None:
-    """Put away what cannot be judged beside the causes taken."""
+    """Reject causes that cannot be judged together with the causes found."""
     for a in found.model.active:
         for name, cause in catalogue().items():
             if cause.family in a.cause.conceals and name not in (*barred, *found.model.names):
@@ -348,7 +348,7 @@ def _conceal(found: Found, barred: set[str]) -> None:
 
 
 def _add(found: Found, barred: set[str]) -> bool:
-    """Add the best cause if it stands up; tell whether it did."""
+    """Add the best cause if it passes the tests; return True if it did."""
     rivals = _visible(found, _rivals(found, barred), barred)
     if not rivals:
         return False
@@ -386,7 +386,7 @@ def _add(found: Found, barred: set[str]) -> bool:
 
 
 def _visible(found: Found, rivals: list[Rival], barred: set[str]) -> list[Rival]:
-    """Return rivals that the way of recording cannot feign; put the others away."""
+    """Return candidates that the recording cannot imitate; reject the others."""
     seen = []
     for rival in rivals:
         if why := hidden(rival.added, found.task.grids):
@@ -397,15 +397,15 @@ def _visible(found: Found, rivals: list[Rival], barred: set[str]) -> list[Rival]
     return seen
 
 
-# Parameters with a time scale, in s, and slacks, in % of opening.
+# Parameters that are a time in s or a backlash in % of opening.
 _TIMES = {'clock': 'd_s', 'reheater': 'time_s', 'region_lag': 'time_s', 'rate_limit': ''}
 _SLACKS = {'backlash': 'w_percent', 'stiction': 's_percent'}
 
 
 def hidden(added: Active, grids: Grids) -> str:
-    """Return why a record cannot tell a cause of this size from its own recording; '' if it can.
+    """Return why the recording may hide or imitate a cause of this size; '' if it cannot.
 
-    A rate limit counts with the time that a usual fast move takes.
+    For a rate limit, the duration of a typical fast move counts.
     """
     values, blur = added.named(), grids.blur
     if added.name in _SLACKS:
@@ -418,7 +418,7 @@ def hidden(added: Active, grids: Grids) -> str:
 
 
 def unseen(name: str, grids: Grids) -> str:
-    """Return what of a cause the way of recording hides; '' if nothing."""
+    """Return the range of a cause that the recording hides; '' if there is none."""
     blur = grids.blur
     if not blur.words or name not in (*_TIMES, *_SLACKS):
         return ''
@@ -428,7 +428,7 @@ def unseen(name: str, grids: Grids) -> str:
 
 
 def _take(found: Found, rival: Rival, gain: float) -> None:
-    """Fit the model with its new cause, and find curve and regions anew where that is due."""
+    """Fit the model with its new cause; identify curve and regions again after a strong one."""
     found.task, settled, _ = settle(found.task, rival.model, rounds=1, steps=3)
     found.model = held(found.task.grids, settled, found.task.ar)
     if gain > STRONG and not found.task.fixed_dynamics:
@@ -436,7 +436,7 @@ def _take(found: Found, rival: Rival, gain: float) -> None:
 
 
 def _absorb(found: Found, rival: Rival) -> None:
-    """Make what an identification may find too a part of the plain model: it is no fault."""
+    """Make an effect that an identification may also find part of the plain model: no fault."""
     name = rival.added.name
     found.evidence.pop(name, None)
     found.near.pop(name, None)
@@ -448,7 +448,7 @@ def _absorb(found: Found, rival: Rival) -> None:
 
 
 def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]]:
-    """Return starts worth a full refit: the best, and the families of the best."""
+    """Return starts to be refitted: the best ones, and the families of the best ones."""
     every = causes_for(screening.task.grids)
     starts: dict[str, list[Start]] = {}
     for name, cause in every.items():
@@ -465,7 +465,7 @@ def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]
 
 
 def _rivals(found: Found, barred: set[str]) -> list[Rival]:
-    """Refit every promising cause; best score first, one entry a cause."""
+    """Refit every promising cause; return one candidate per cause, best score first."""
     screening = Screening(found.task, found.model, found.rough)
     shortlist = _shortlist(screening, barred)
     every = causes_for(found.task.grids)
@@ -479,7 +479,7 @@ def _rivals(found: Found, barred: set[str]) -> list[Rival]:
         refits.append(_refit(found.task, model.with_cause(added), frozen))
     if not refits:
         return []
-    # The noise is what the best of them leaves.
+    # The noise variance is that of the best refit.
     e = found.task.innovations(found.task.residual(min(refits, key=lambda r: r[1])[0]))
     variance = float(e @ e) / len(e) * colour(found.task, e)
     best: dict[str, Rival] = {}
@@ -493,9 +493,9 @@ def _rivals(found: Found, barred: set[str]) -> list[Rival]:
 
 
 def _fair(task: Task, rival: Rival, others: dict[str, Rival], variance: float) -> Rival:
-    """Return a rival that contains a simpler one scored by what it has more, and by that alone.
+    """Return a candidate scored only by what it explains beyond a simpler cause that it contains.
 
-    Several draws of the noise smooth a path, and that is worth something without any jump.
+    Averaging several noise realisations smooths a path, which is a gain even without a jump.
     """
     cause = rival.added.cause
     if cause.simpler is None or cause.contains not in others:
@@ -513,7 +513,7 @@ def _fair(task: Task, rival: Rival, others: dict[str, Rival], variance: float) -
 def _refit(task: Task, model: Extended, tangents: FloatArray | None) -> tuple[Extended, float]:
     """Fit a model whose last cause is new; return it and its sum of squares."""
     if 'clock' in model.names:
-        tangents = None  # it holds one delay, which changes the columns
+        tangents = None  # one delay is fixed with it, which changes the columns
     model, cost = improve(task, model, 3, tangents)
     model, cost = search_lines(task, model, cost)
     model, cost = search_levels(task, model, cost, _SHORT_STEPS_MW)
@@ -521,7 +521,7 @@ def _refit(task: Task, model: Extended, tangents: FloatArray | None) -> tuple[Ex
 
 
 def _drop_weak(found: Found, barred: set[str]) -> None:
-    """Take out each earlier cause that the later ones have made superfluous."""
+    """Remove each earlier cause that the later ones have made superfluous."""
     for a in found.model.active[:-1]:
         if len(found.model.active) < 2:
             return

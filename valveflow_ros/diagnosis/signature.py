@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where the simulation is wrong: the residual against what was measured, and after fast moves."""
+"""Where the simulation is wrong: the residual over measured variables and after fast moves."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class Signature:
     middle, before, after : float64 (k,)
         Middle of each bin, mean residual in MW of the plain and of the extended model.
     chance : float64 (k,)
-        How far the mean of a bin strays by chance in one of a hundred records, MW.
+        Absolute mean of a bin that is exceeded by chance in one of a hundred records, MW.
     share_before, share_after, share_chance : float
-        Part of the residual's variance between bins, and what chance reaches in one of a
-        hundred records (residual shifted in time).
+        Fraction of the residual's variance between bins, and the fraction reached by chance in
+        one of a hundred records (estimated with the residual shifted in time).
     """
 
     variable: str
@@ -58,7 +58,7 @@ class Signature:
 
 
 def signatures(task: Task, before: Extended, after: Extended) -> tuple[Signature, ...]:
-    """Return the residual against every variable, on all blocks."""
+    """Return the residual over every variable, on all blocks."""
     old, good, _, _ = minutes(task, task.residual(before))
     new = minutes(task, task.residual(after))[0]
     values = {n: v for n, v in variables(task, before).items() if n in UNITS}
@@ -69,7 +69,7 @@ def signatures(task: Task, before: Extended, after: Extended) -> tuple[Signature
 
 
 def _direction(task: Task) -> FloatArray:
-    """Return where the opening stands inside a slack: -1 after closing, 1 after opening."""
+    """Return the position inside a backlash gap: -1 after closing, 1 after opening."""
     grids = task.grids
     v = minutes(task, grids.means(grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0))))[0]
     out, state, half = np.empty(len(v)), v[0], 0.5 * _PLAY_PERCENT
@@ -82,7 +82,7 @@ def _direction(task: Task) -> FloatArray:
 def _signature(
     name: str, value: FloatArray, old: FloatArray, new: FloatArray, good: BoolArray
 ) -> Signature:
-    # Values that many minutes share (the end of a slack) would make bins without any.
+    # Values shared by many minutes (the end of the gap) would give empty bins.
     edges = np.unique(np.quantile(value[good], np.linspace(0.0, 1.0, BINS + 1)[1:-1]))
     cell = np.unique(np.searchsorted(edges, value[good], side='right'), return_inverse=True)[1]
     count = np.bincount(cell)
@@ -122,7 +122,7 @@ class Answer:
 
 
 def after_moves(task: Task, before: Extended, after: Extended) -> tuple[Answer, ...]:
-    """Return the mean residual around fast moves, opening and closing apart."""
+    """Return the mean residual around fast moves, separately for opening and closing."""
     grids = task.grids
     v = grids.means(grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0)))
     span = max(1, round(_FAST_S / grids.mean_s))
@@ -150,7 +150,7 @@ def after_moves(task: Task, before: Extended, after: Extended) -> tuple[Answer, 
     return tuple(out)
 
 
-# Maps of the residual over two variables at once: what depends on both shows in neither alone.
+# Maps of the residual over two variables: an effect of both may be invisible over each alone.
 
 CELLS = 14
 PAIRS = (('time', 'u'), ('pressure given u', 'u'))
@@ -165,15 +165,15 @@ class ResidualMap:
     Attributes
     ----------
     across, up : str
-        The variables.
+        The variables on the horizontal and vertical axis.
     across_edges, up_edges : float64 (k + 1,), (m + 1,)
     before, after : float64 (m, k)
-        Mean residual in MW of the plain and of the extended model, NaN where too few minutes
-        lie or where it is within what chance reaches in one of a hundred records.
+        Mean residual in MW of the plain and of the extended model; NaN in cells with too few
+        minutes or with a mean that chance exceeds in one of a hundred records.
     shown_before, shown_after : int
-        Cells beyond chance.
+        Number of cells beyond chance.
     cells : int
-        Cells with enough minutes; one in a hundred of them is beyond chance by chance.
+        Number of cells with enough minutes; one in a hundred of them exceeds the limit by chance.
     """
 
     across: str
@@ -188,7 +188,7 @@ class ResidualMap:
 
 
 def residual_maps(task: Task, before: Extended, after: Extended) -> tuple[ResidualMap, ...]:
-    """Return the residual over u and time, and over u and the pressure that u does not explain."""
+    """Return the residual over u and time, and over u and the pressure not explained by u."""
     old, good, _, _ = minutes(task, task.residual(before))
     new = minutes(task, task.residual(after))[0]
     values = variables(task, before)
@@ -226,20 +226,20 @@ def _map(
 
 
 def _chance(x: FloatArray, means: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Return the size that one cell in a hundred reaches when the residual is shifted in time."""
+    """Return the 99 % limit of each cell, from residuals shifted in time."""
     rng = np.random.default_rng(_MAP_SEED)
     low = min(len(x) // 4, 1440)
     shifted = [means(np.roll(x, int(rng.integers(low, len(x) - low)))) for _ in range(_MAP_SHIFTS)]
     return np.asarray(2.576 * np.sqrt(np.mean(np.square(shifted), axis=0)))
 
 
-# What the pictures of a diagnosis show, taken from the record and the models.
+# Data for the figures of a diagnosis, from the record and the models.
 
 Views = tuple[tuple[Signature, ...], tuple[Answer, ...], tuple[ResidualMap, ...]]
 
 
 def views(record: Record, found: Diagnosis) -> Views:
-    """Return residuals by variable, around fast moves and in maps, before and after extending."""
+    """Return residuals by variable, around fast moves and in maps, for both models."""
     bad, _ = record.faults()
     grids = record.grids(bad)
     task = Task(grids, grids.whole, np.zeros(ORDER))

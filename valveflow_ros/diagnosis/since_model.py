@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What changed between the log that a given model was found in and the record.
+"""The change between the record of a given model and the current record.
 
-Means of half an hour of what the model leaves, held as it is, are regressed on what would have
-changed: the power per flow, the reading of the input, the zero of the power, or the curve, as hats
-of the load. Each is fitted beside a slow wander (`slow`), each number paid for. The name of a
-single change stands only where it tells as much as the hats and clearly more than the others.
+Half-hour means of the residual of the given model are regressed on the effect of each change: the
+power per flow, the scale of the input, the zero of the power, or the curve, as hat functions of
+the load. Each regression includes a slow disturbance (`slow`), with a penalty per parameter. A
+single change is named only if it explains as much as the curve and clearly more than the others.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _HATS = 5
 _ROUNDS = 3
 _SECANT = 0.004
 _TOLD = 10.0  # log-likelihood by which one change must be better than another
-_BETTER = 6.0  # by which the hats must be better than one change, and one change than none
-# Two curves of one healthy unit differ by about this share of the largest power, and where weather
-# moves the unit from day to day by as much as it does so. A smaller change is none, and the
-# interval of a larger one is no narrower.
+_BETTER = 6.0  # by which the curve must be better than one change, and one change than none
+# Two curves of one healthy unit differ by about this fraction of the largest power. If the weather
+# changes the power from day to day, they differ by the size of these changes. Smaller changes are
+# not reported, and the interval of a larger change is at least as wide.
 _LEAST_SHARE = 0.0025
 _OF_DAYS = 2.0
 _LEAST_DAYS = 3
-_EXPLAINED = 0.5  # of the square of a change, by which it must lower that of the residual
-_LOW, _HIGH = 0.05, 0.95  # quantiles of the load at which a change of the curve is told
+_EXPLAINED = 0.5  # reduction of the mean square residual, as a fraction of that of the change
+_LOW, _HIGH = 0.05, 0.95  # quantiles of the load at which a change of the curve is reported
 _FULL_LOAD = 0.9
 _Z95 = 1.959963984540054
 
@@ -62,7 +62,7 @@ def _more_offset(base: RegionalModel, b_mw: float) -> RegionalModel:
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """A change of one number: how it acts on a model, and how it is told."""
+    """A change with one parameter: its effect on a model, and its description."""
 
     act: Callable[[RegionalModel, float], RegionalModel]
     parameter: str
@@ -97,19 +97,19 @@ _EXPERIMENT = (
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What changed since the log of the model given.
+    """The change since the log of the given model.
 
     Attributes
     ----------
     name : str
         'gain_change', 'input_change', 'offset_change' or 'curve_change'.
     given, changed : Extended
-        The model as given, and with the change.
+        The given model, without and with the change.
     parameters : dict
         By name, with 95 % intervals.
     sentence, meaning : str
     near : tuple of str
-        Changes of one number that do nearly as well.
+        Changes with one parameter that fit nearly as well.
     """
 
     name: str
@@ -121,12 +121,12 @@ class Change:
     near: tuple[str, ...] = ()
 
     def cause(self, task: Task, plain: Extended) -> NamedCause:
-        """Return it as a cause, with its gain on the sealed blocks.
+        """Return the change as a cause, with its gain on the sealed (test) blocks.
 
         Parameters
         ----------
         plain : Extended
-            With a curve found anew, which stands for a change of the curve.
+            With a newly fitted curve, which is used for a change of the curve.
         """
         after = plain if self.name == CURVE else self.changed
         gain = sealed_gain(task, self.given, after, len(_KINDS) + 1)
@@ -138,14 +138,14 @@ class Change:
 
 
 def since_model(task: Task, base: RegionalModel) -> Change | str:
-    """Return what changed since a model was found, or in a sentence that nothing is known to have.
+    """Return the change since a model was found, or a sentence that none is known.
 
     Parameters
     ----------
     task : Task
-        Only its open blocks are looked at.
+        Only its open blocks are used.
     base : RegionalModel
-        The model given, held as it is.
+        The given model; it is not refitted.
     """
     given = Extended(base)
     here = answer(task.grids, given)
@@ -172,7 +172,7 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
         _LEAST_SHARE * float(np.quantile(task.grids.power[task.rows], 0.99)),
         _OF_DAYS * _spread_of_days(found.power - by_curve, found.hours),
     )
-    # What it leaves to the hats must be more than two curves of one unit differ by.
+    # Its difference from the curve must exceed the usual one between two curves of one unit.
     whole = by_hats - score[best] > _BETTER and _rms(by_curve - alone) > least
     there = max(by_hats, score[best]) - none.likelihood > _BETTER
     if not there or not _explains(by_curve if whole or near else alone, found.power, least):
@@ -193,7 +193,7 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
 
 
 def _spread_of_days(left: FloatArray, hours: FloatArray) -> float:
-    """Return the standard deviation of the means of days; 0 of fewer than three."""
+    """Return the standard deviation of daily means; 0 with fewer than three days."""
     day = (hours // 24.0).astype(int)
     count = np.bincount(day)
     full = count >= 0.5 * count.max()
@@ -206,7 +206,7 @@ def _rms(x: FloatArray) -> float:
 
 
 def _explains(moved: FloatArray, left: FloatArray, least: float) -> bool:
-    """Tell whether a change is large, and makes what is left smaller, not a wander beside it."""
+    """Return True if a change is large and reduces the residual, unlike a slow disturbance."""
     size = _rms(moved) ** 2
     less = float(np.mean(left**2) - np.mean((left - moved) ** 2))
     return size > least**2 and less > _EXPLAINED * size
@@ -218,7 +218,7 @@ def _hats(here: FloatArray) -> FloatArray:
 
 
 def _one(task: Task, base: RegionalModel, name: str) -> tuple[float, Regression]:
-    """Fit a change of one number; return its value and the last regression."""
+    """Fit a change with one parameter; return its value and the last regression."""
     kind, value = _KINDS[name], 0.0
     for _ in range(_ROUNDS):
         model = Extended(kind.act(base, value))
@@ -229,7 +229,7 @@ def _one(task: Task, base: RegionalModel, name: str) -> tuple[float, Regression]
 
 
 def _column(task: Task, model: Extended, name: str, value: float) -> FloatArray:
-    """Return how the prediction moves with the number of a change, (m,)."""
+    """Return the derivative of the prediction by the parameter of a change, (m,)."""
     grids = task.grids
     if name == 'offset_change':
         return np.ones(len(grids.power))
@@ -244,7 +244,7 @@ def _column(task: Task, model: Extended, name: str, value: float) -> FloatArray:
 
 
 def _levels_as_fit(task: Task, base: RegionalModel, changed: RegionalModel) -> RegionalModel:
-    """Return the changed model with regions that meet at the MW or at the u that they met at."""
+    """Return the changed model with levels at the same MW or the same u as before."""
     return min(
         (changed, levels_along(base, changed, _scale(task))),
         key=lambda model: task.cost(Extended(model)),

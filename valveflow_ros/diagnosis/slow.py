@@ -1,21 +1,21 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The slow part of what a model leaves: a drift of the power over hours and days.
+"""The slow part of the residual: a drift of the power over hours and days.
 
-The residual is averaged over sub-blocks of half an hour and taken for the sum of three parts:
-what the curve could still take up (hats of the load with free coefficients), a wander of the
-plant's gain, and noise. The wander is a stationary first-order process, an Ornstein-Uhlenbeck
-process, of unknown variance and time scale:
+The residual is averaged over sub-blocks of half an hour and modelled as the sum of three parts:
+what the curve could still explain (hat functions of the load with free coefficients), a slow
+disturbance of the plant's gain ("wander"), and noise. The wander is a stationary first-order
+process (Ornstein-Uhlenbeck) of unknown variance and time scale:
 
     r_i = z_i a + P_i w_i + e_i,   cov(w_i, w_j) = s^2 exp(-|t_i - t_j| / T)
 
-with P_i the mean load relative to that of the record. Variance and time scale are those of the
-largest likelihood on a grid, for the size of the wander of the largest restricted likelihood;
-coefficients and the noise's variance are known in closed form.
+with P_i the mean load relative to that of the record. Variance and time scale are found on a grid
+by maximum likelihood; the size of the wander by restricted maximum likelihood. The coefficients
+and the variance of the noise have closed solutions.
 
-A change of the power in time that is no wander has a shape: steps, a drift that begins late, an
-exponential. Shapes are added to the mean of the same process and compared by the likelihood, each
-number paid for. A step takes place at once or within four hours.
+Other changes of the power in time have a shape: steps, a drift that begins late, an exponential.
+Shapes are added to the mean of the same process and compared by the likelihood with a penalty per
+parameter. A step takes place at once or within four hours.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TIME_SCALES_H = (0.5, 1.0, 3.0, 8.0, 24.0, 72.0, 240.0)
 _RATIOS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10_000.0)
 _HATS = 9
 _SMALLEST = 1e-3
-_HALF = 0.5  # of the usual number of means, for a sub-block to count
+_HALF = 0.5  # fraction of the usual number of means that a sub-block must have
 _MOST_ROWS = 500  # longer records are averaged over several sub-blocks
 _LEAST_ROWS = 40
 _SLOWEST_OF_NOISE_H = 2.0
@@ -46,7 +46,7 @@ LEAST_DRIFT_MW = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Means of half an hour of what a model leaves.
+    """Half-hour means of the residual of a model.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Levels:
     load : float64 (k,)
         Mean load relative to that of the record.
     free : float64 (k, p)
-        What curve and pressure could take up, as an orthonormal basis.
+        What curve and pressure could explain, as an orthonormal basis.
     noise : float64 (k,)
         Relative variance of each mean.
     """
@@ -70,7 +70,7 @@ class Levels:
 
     @property
     def enough(self) -> bool:
-        """Tell whether a wander can be told from what the curve could take up."""
+        """Return True if there are enough means to separate a wander from the curve."""
         rows, columns = self.free.shape
         return bool(rows - columns >= _LEAST_ROWS)
 
@@ -78,14 +78,14 @@ class Levels:
 def levels(
     task: Task, model: Extended, rows: BoolArray, careful: bool
 ) -> tuple[Levels, FloatArray]:
-    """Return means over sub-blocks of some rows, and those of the covariates, (k, covariates).
+    """Return means over groups of sub-blocks, and those of the covariates, (k, covariates).
 
     Parameters
     ----------
     careful : bool
-        Functions of the input and of the pressure are free too, not of the load alone. Under
-        load control and sliding pressure they take up much of a drift: the pressure tells the
-        load that was wanted, the opening what it took.
+        Free functions of the input and of the pressure are used too, not only of the load. Under
+        load control and sliding pressure they absorb much of a drift: the pressure follows the
+        load set point, the opening what was needed to reach it.
     """
     grids = task.grids
     here = answer(grids, model)
@@ -103,7 +103,7 @@ def levels(
 def half_hours(
     task: Task, model: Extended, rows: BoolArray, columns: Sequence[FloatArray]
 ) -> Levels:
-    """Return means over sub-blocks of some rows, ``free`` those of columns (m,) as they are."""
+    """Return means over groups of sub-blocks; ``free`` holds those of the given columns (m,)."""
     grids = task.grids
     sub = grids.sub // max(1, -(-grids.subs // _MOST_ROWS))
     here = answer(grids, model)
@@ -123,7 +123,7 @@ def half_hours(
 
 
 def deviation(grids: Grids, name: str) -> FloatArray:
-    """Return by how much a covariate departs from its usual value at the load, (m,), its unit."""
+    """Return covariate minus its usual value at the load, (m,), in its unit."""
     about, here = grids.covariates[name]
     return grids.means(here - about.usual(grids.u, grids.pressure))
 
@@ -135,14 +135,14 @@ def _hats(x: FloatArray, rows: BoolArray) -> Iterator[FloatArray]:
 
 
 def _basis(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis: the hats of each input alone sum to one."""
+    """Return an orthonormal basis: the columns are dependent, as hat functions sum to one."""
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, sizes > _SMALLEST * sizes[0]])
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """A wander: its log-likelihoods, time scale in h, variance relative to the noise's."""
+    """A wander: log-likelihoods, time scale in h, variance relative to that of the noise."""
 
     likelihood: float
     restricted: float
@@ -156,7 +156,7 @@ def _covariance(found: Levels, hours: float) -> FloatArray:
 
 
 def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fit, float]]:
-    """Yield every wander tried, and the log-likelihood that a column adds to it."""
+    """Yield every wander of the grid, and the log-likelihood gain of an additional column."""
     k, p = found.free.shape
     flat = found.power, *(found.free.T), *(() if column is None else (column,))
     table = np.column_stack(flat)
@@ -182,7 +182,7 @@ def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fi
 
 
 def _wanders(found: Levels, most_h: float = math.inf) -> Iterator[tuple[FloatArray, float, float]]:
-    """Yield the factor of the covariance of every wander tried, its time scale and variance."""
+    """Yield covariance factor, time scale and variance of every wander of the grid."""
     for hours in (h for h in _TIME_SCALES_H if h <= most_h):
         wander = _covariance(found, hours)
         for ratio in (0.0, *_RATIOS) if hours == _TIME_SCALES_H[0] else _RATIOS:
@@ -191,7 +191,7 @@ def _wanders(found: Levels, most_h: float = math.inf) -> Iterator[tuple[FloatArr
 
 @dataclass(frozen=True, slots=True)
 class Regression:
-    """Coefficients (p,), their covariance (p, p), and the log-likelihood, beside a wander."""
+    """Coefficients (p,), covariance (p, p), and log-likelihood of a regression with a wander."""
 
     likelihood: float
     coefficients: FloatArray
@@ -199,15 +199,15 @@ class Regression:
 
 
 def regressions(found: Levels, choices: Sequence[Sequence[int]]) -> list[Regression]:
-    """Regress the power on some of the free columns, each time under the wander that suits best.
+    """Regress the power on some of the free columns, each time with the best wander.
 
-    The wander forgets within a fourth of the record: one that lasts longer would be the change of
-    the whole record that is looked for.
+    The time scale of the wander is at most a fourth of the record. A longer one could not be
+    distinguished from the change of the whole record.
 
     Parameters
     ----------
     choices : sequence of sequence of int
-        The columns of each regression; none of them is a wander alone.
+        The columns of each regression; an empty sequence means a wander only.
     """
     best: list[Regression | None] = [None] * len(choices)
     k = len(found.power)
@@ -230,11 +230,11 @@ def regressions(found: Levels, choices: Sequence[Sequence[int]]) -> list[Regress
 
 
 def covariate_gain(task: Task, model: Extended, name: str) -> float:
-    """Return the log-likelihood that a covariate brings beside a slow wander of the power.
+    """Return the log-likelihood gain of a covariate in a model with a slow wander of the power.
 
-    With and without it the wander has the variance and the time scale that suit it best. A
-    covariate that the power follows leaves no wander, or a much smaller one; one that only looks
-    alike leaves it as large as before.
+    Variance and time scale of the wander are optimised with and without the covariate. With a
+    covariate that the power follows, no wander or a much smaller one remains; with one that is
+    only similar by chance, it stays as large as before.
     """
     found, columns = levels(task, model, task.rows, careful=True)
     if not found.enough:
@@ -247,18 +247,18 @@ def covariate_gain(task: Task, model: Extended, name: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """How far the power drifts over hours and days without a cause.
+    """Size of the unexplained drift of the power over hours and days.
 
     Attributes
     ----------
     gain : float
-        Log-likelihood that the wander brings over none.
+        Gain in log-likelihood by the wander.
     rms_mw : float
         Root mean square of the wander about its mean over the record, in MW.
     time_scale_s : float
-        Time after which it has forgotten about two thirds of where it was.
+        Time in which its autocorrelation falls to 1/e.
     least_mw : float
-        A smaller one is none.
+        Smaller drifts are ignored.
     """
 
     gain: float
@@ -268,18 +268,17 @@ class Drift:
 
     @property
     def there(self) -> bool:
-        """Tell whether it is more than chance, and slow."""
+        """Return True if the drift is significant and slow."""
         slow = self.time_scale_s >= 3600.0 * _SLOWEST_OF_NOISE_H
         return slow and self.gain > _LEAST_DRIFT_GAIN and self.rms_mw > self.least_mw
 
 
 def drift(task: Task, model: Extended) -> Drift:
-    """Estimate the slow wander of the power that a model leaves.
+    """Estimate the slow wander of the power in the residual of a model.
 
-    Its size is the root mean square over the record of P_i w_i about its mean, as the data let it
-    be expected: the square of what is estimated and the variance that remains. What of the wander
-    goes along with the load by chance was taken up by the curve; it cannot be seen, but counts as
-    far as the part that can be seen makes it likely.
+    Its size is the expected root mean square of P_i w_i about its mean over the record, given the
+    data: the square of the estimate plus the remaining variance. The curve has absorbed the part
+    of the wander that correlates with the load by chance; its expected square is included.
     """
     found, _ = levels(task, model, task.grids.whole, careful=False)
     if not found.enough:
@@ -293,7 +292,7 @@ def drift(task: Task, model: Extended) -> Drift:
     wander = best.ratio * _covariance(found, best.hours)
     factor = cho_factor(np.diag(found.noise) + wander, lower=True)
     held = cho_solve(factor, found.free)
-    # V^-1 without what the curve can take up.
+    # V^-1 without the part that the curve can explain.
     seen = cho_solve(factor, np.eye(k)) - held @ np.linalg.solve(found.free.T @ held, held.T)
     noise_mw2 = float(found.power @ seen @ found.power) / (k - p)
     level = wander @ (seen @ found.power)
@@ -306,39 +305,39 @@ def drift(task: Task, model: Extended) -> Drift:
 
 # The shape of a change in time.
 #
-# Each shape is P_i f(t_i). A step at a wrong time, or a drift with a step, can stand for many
-# other shapes; so names of causes in time are held against the shapes, and against a wander alone.
+# Each shape is P_i f(t_i). A step at a wrong time, or a drift with a step, can imitate many other
+# shapes. So the causes in time are compared with the shapes, and with a wander alone.
 
-PENALTY = 5.0  # log-likelihood that each number chosen from the data must bring
-_OF_WANDER = 2.0 * 2.0  # for its variance and its time scale, which are tried on a grid
+PENALTY = 5.0  # log-likelihood that each parameter chosen from the data must gain
+_OF_WANDER = 2.0 * 2.0  # penalty for its variance and its time scale, which are found on a grid
 _MOMENTS = 96
-_EDGE = 0.04  # of the record, at either end, in which nothing is seen to begin
-_APART = 2  # moments between two steps
-_SPREADS_H = (0.0, 4.0)  # within which a step takes place; two steps have the same
-_RATES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # time constants in lengths of the record
+_EDGE = 0.04  # fraction of the record at each end without onsets
+_APART = 2  # least distance between two steps, in grid times
+_SPREADS_H = (0.0, 4.0)  # duration of a step; two steps have the same one
+_RATES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # time constants relative to the length of the record
 NO_SHAPE, NAMED_SHAPE = 'wander', 'named'
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """How the power changes in time, as one of the shapes tried.
+    """The change of the power in time, as one of the shapes.
 
     Attributes
     ----------
     name : str
         'drift', 'step', 'late drift', 'exponential', 'drift and step', 'drift and back',
         'there and back', 'two steps'; `NO_SHAPE` for a wander alone and `NAMED_SHAPE` for
-        the causes named.
+        the named causes.
     score : float
-        Log-likelihood, less what its numbers cost.
+        Log-likelihood minus the penalty for its parameters.
     mw : tuple of float
-        Its sizes at the mean load, in MW; of an exponential what it came to by the end.
+        Sizes at the mean load, in MW; for an exponential the change until the end.
     at_s : tuple of float
-        Its moments in s since the first row; of an exponential the time constant.
+        Times in s since the first row; for an exponential the time constant.
     rms_mw : float
         Root mean square about its mean over the record.
     spread_s : float
-        Time that each of its steps takes, about `at_s`; 0 for at once.
+        Duration of each of its steps, centred on `at_s`; 0 for a sudden step.
     """
 
     name: str
@@ -351,7 +350,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Columns of a shape, (k, columns), and what it is told by."""
+    """Columns of a shape, (k, columns), and its description."""
 
     name: str
     columns: FloatArray
@@ -361,7 +360,7 @@ class _Shape:
 
 
 def _shapes(found: Levels) -> list[_Shape]:
-    """Return every shape of one column; steps first, by their spread and in order of time."""
+    """Return every shape of one column; steps first, by duration and then time."""
     t, load = found.hours, found.load
     span = float(t[-1] - t[0])
     moments = np.linspace(t[0] + _EDGE * span, t[-1] - _EDGE * span, _MOMENTS)
@@ -369,7 +368,7 @@ def _shapes(found: Levels) -> list[_Shape]:
     after = t[:, None] >= moments
     steps = [
         _Shape('step', column * load, (3600.0 * float(at),), 3 if spread else 2, 3600.0 * spread)
-        for spread in _SPREADS_H if spread <= 2.0 * _EDGE * span  # whole within the record
+        for spread in _SPREADS_H if spread <= 2.0 * _EDGE * span  # step inside the record
         for column, at in zip(
             np.clip((t[:, None] - moments) / max(spread, 1e-9) + 0.5, 0.0, 1.0).T,
             moments, strict=True,
@@ -392,15 +391,15 @@ def _shapes(found: Levels) -> list[_Shape]:
 
 
 def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Course]:
-    """Return the best course of each shape, by name; empty in a record too short for any.
+    """Return the best fit of each shape, by name; empty if the record is too short.
 
     Parameters
     ----------
     task : Task
     model : Extended
     names : sequence of str
-        Causes in time that the model holds: they are taken out, and what they do together is a
-        shape of its own, `NAMED_SHAPE`, that has cost its numbers.
+        Causes in time that the model contains. They are removed, and their joint effect is one
+        more shape, `NAMED_SHAPE`, with a penalty for their parameters.
     """
     without = model
     for name in names:
@@ -427,7 +426,7 @@ def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Cour
 def _scored(
     found: Levels, single: list[_Shape], columns: FloatArray
 ) -> Iterator[tuple[str, float, tuple[int, ...], FloatArray]]:
-    """Yield name, score, columns and sizes of every shape's best, under every wander tried."""
+    """Yield name, score, columns and sizes of the best fit of every shape, for every wander."""
     k, p = found.free.shape
     table = np.column_stack([found.power, found.free, columns])
     kinds = np.array([s.name for s in single])
@@ -457,7 +456,7 @@ def _scored(
             spread_s = single[steps[0]].spread_s
             more = PENALTY * (spread_s > 0.0)
             between_s = single[steps[1]].at_s[0] - single[steps[0]].at_s[0]
-            # The second begins when the first is over: their sizes are what the power did.
+            # The second step begins after the first: their sizes are real changes of the power.
             apart = max(_APART, math.ceil(spread_s / between_s))
             gain, a, b = _pairs(gram, toward, np.full(_MOMENTS, drift_at), steps)
             j = int(gain.argmax())
@@ -470,7 +469,7 @@ def _scored(
             chosen = int(one[j]), int(two[j])
             score = worth(gain) - 4 * PENALTY - more
             yield 'two steps', float(score[j]), chosen, np.array([a[j], b[j]])
-            # The same two of equal size and opposite sign.
+            # The same two steps with equal size and opposite sign.
             square = np.maximum(gram[one, one] + gram[two, two] - 2.0 * gram[one, two], 1e-12)
             less = toward[one] - toward[two]
             gain = less**2 / square
@@ -484,7 +483,7 @@ def _scored(
 def _pairs(
     gram: FloatArray, toward: FloatArray, one: IntArray, two: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what pairs of columns explain together, and the size of either."""
+    """Return the gain of pairs of columns, and their two coefficients."""
     g11, g22, g12 = gram[one, one], gram[two, two], gram[one, two]
     b1, b2 = toward[one], toward[two]
     det = np.maximum(g11 * g22 - g12 * g12, 1e-9 * g11 * g22 + 1e-300)

@@ -1,12 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Whether there is still something in the residual, and on what it depends.
+"""Test for remaining structure in the residual, and the variables on which it depends.
 
-Means of a minute are sorted into cells by one, two or three variables at a time; the mean of
-each cell, estimated on some blocks, is held against other blocks. No function of the
-measured power is among the variables: it would carry the noise into them. The power control
-does carry past noise into the opening; so it is innovations that are looked at, which know
-nothing of the past.
+Minute means are sorted into cells by one, two or three variables at a time. The mean of each
+cell, estimated on some blocks, is tested on other blocks. The variables do not include functions
+of the measured power, because they would share its noise. Power control also feeds past noise
+into the opening; therefore innovations are used, which are independent of the past.
 """
 
 from __future__ import annotations
@@ -35,15 +34,15 @@ _IN_TRIPLES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What cells explain.
+    """The result of the cell test.
 
     Attributes
     ----------
     variables : tuple of str
     gain : float
-        Log-likelihood on held-out blocks, the noise's correlation taken into account.
+        Gain in log-likelihood on held-out blocks, corrected for the correlation of the noise.
     sign : float
-        Mean over standard error of the gains of blocks.
+        t value of the gains of blocks: mean divided by standard error.
     explained_mw2 : float
         Variance explained on held-out blocks.
     """
@@ -55,12 +54,12 @@ class Structure:
 
     @property
     def there(self) -> bool:
-        """Tell whether it is more than chance."""
+        """Return True if the structure is significant."""
         return self.gain > LEAST_GAIN and self.sign > LEAST_SIGN and self.explained_mw2 > LEAST_MW2
 
 
 def minutes(task: Task, series: FloatArray) -> tuple[FloatArray, BoolArray, np.ndarray, int]:
-    """Return means of a minute, where they are open and whole, their block, rows in each."""
+    """Return minute means, which of them are complete, their block, scored means per minute."""
     grids = task.grids
     rows = max(1, round(_MINUTE_S / grids.mean_s))
     m = len(series) // rows
@@ -71,7 +70,7 @@ def minutes(task: Task, series: FloatArray) -> tuple[FloatArray, BoolArray, np.n
 
 
 def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
-    """Return what the residual might depend on, one value a minute."""
+    """Return the variables on which the residual might depend, one value per minute."""
     grids = task.grids
 
     def minute(rows: FloatArray) -> FloatArray:
@@ -114,7 +113,7 @@ def _cells(values: FloatArray, good: BoolArray, count: int) -> np.ndarray:
 def _tables(
     values: dict[str, FloatArray], good: BoolArray
 ) -> list[tuple[tuple[str, ...], np.ndarray]]:
-    """Return (variables, cell of every minute) for every table that is tried."""
+    """Return (variables, cell of every minute) for every table to be tested."""
     medium = {n: _cells(v, good, _MEDIUM) for n, v in values.items()}
     coarse = {n: _cells(v, good, _TRIPLE) for n, v in values.items()}
     tables: list[tuple[tuple[str, ...], np.ndarray]] = [
@@ -137,7 +136,7 @@ def _tables(
 
 
 def _held_out(cell: np.ndarray, rest: FloatArray, fold: np.ndarray, shrink: float) -> FloatArray:
-    """Return the gain in squared MW of every row, its cell's mean taken from other folds."""
+    """Return the gain in squared MW of every row, with cell means from the other folds."""
     count = int(cell.max()) + 1
     gain = np.zeros(len(rest))
     sums = np.array([np.bincount(cell[fold == f], rest[fold == f], count) for f in range(FOLDS)])
@@ -151,13 +150,13 @@ def _held_out(cell: np.ndarray, rest: FloatArray, fold: np.ndarray, shrink: floa
 
 
 def structure(task: Task, model: Extended, wandering: FloatArray | None = None) -> Structure:
-    """Look for structure that the model leaves.
+    """Search for structure in the residual of a model.
 
     Parameters
     ----------
     wandering : float64 (m,), optional
-        A slow disturbance in MW. It is taken away first; where nothing is left then, what looks
-        like it may still hang on something measured, but not on the time.
+        A slow disturbance in MW, which is subtracted first. If no structure remains, the whole
+        residual is tested again, without the time and the time of day as variables.
     """
     everything = task.residual(model)
     values = variables(task, model)
@@ -173,7 +172,7 @@ def structure(task: Task, model: Extended, wandering: FloatArray | None = None) 
 
 
 def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) -> Structure:
-    """Return the best table of a residual."""
+    """Return the table with the largest gain, or a nearly equal one with fewer variables."""
     white = np.zeros(len(series))
     white[task.rows] = task.innovations(series)
     rest, good, block, _ = minutes(task, white)
@@ -181,7 +180,7 @@ def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) ->
     good &= block % FOLDS != SEALED_FOLD
     wide = inflation(rest, good.astype(np.uint8), _LAGS)
     noise = float(np.var(rest[good])) * wide
-    # What lasts for minutes is made smaller by whitening.
+    # Whitening reduces effects that last for minutes; this factor corrects for it.
     again = 1.0 / max(1.0 - float(task.ar.sum()), 0.05) ** 2
     fold, at = block[good] % FOLDS, block[good]
     tried = []
@@ -206,7 +205,7 @@ def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) ->
     return max((s for s in good_ones if len(s.variables) == fewest), key=lambda s: s.gain)
 
 
-# A hidden period: one line of the residual's spectrum far above its neighbours.
+# A hidden period: one line of the residual spectrum far above its neighbours.
 
 LARGEST_P = 1e-5
 _MEAN_S = 60.0
@@ -216,7 +215,7 @@ _SHORTEST_S, _LONGEST_S = 240.0, 5.5 * 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Period:
-    """The strongest line: its period in s, the chance of one as strong, its variance in MW^2."""
+    """The strongest line: its period in s, its p-value, its variance in MW^2."""
 
     period_s: float
     p_value: float
@@ -224,20 +223,20 @@ class Period:
 
     @property
     def there(self) -> bool:
-        """Tell whether it is more than chance."""
+        """Return True if the line is significant."""
         return self.p_value < LARGEST_P
 
     @property
     def words(self) -> str:
-        """Return it as a variable to be named."""
+        """Return the period as the name of a variable."""
         return f'time, with a period of {self.period_s / 60.0:.3g} min'
 
 
 def period(task: Task, model: Extended) -> Period:
-    """Test the largest ordinate of the periodogram (Fisher's test, on a floor of its own).
+    """Test the largest ordinate of the periodogram (Fisher's test, on a local noise floor).
 
-    Each ordinate is divided by the median of its neighbours, which flattens the spectrum
-    of any smooth noise; then ordinates are exponential and the largest of n exceeds
+    Each ordinate is divided by the median of its neighbours, which flattens the spectrum of
+    smooth noise. The ordinates are then exponentially distributed, and the largest of n exceeds
     z by chance with probability n exp(-z).
     """
     grids = task.grids
@@ -254,7 +253,7 @@ def period(task: Task, model: Extended) -> Period:
     ratio[: int(span / _LONGEST_S) + 1] = 0.0
     ratio[int(span / _SHORTEST_S) :] = 0.0
     k = int(np.argmax(ratio))
-    # The window makes neighbours alike; they count as one and a half each.
+    # The window correlates neighbouring ordinates; dividing by 1.3 allows for this.
     chance = min(1.0, len(power) * float(np.exp(-min(ratio[k] / 1.3, 700.0))))
     near = slice(max(k - 2, 0), k + 3)
     share = float(np.maximum(power[near] - floor[near], 0.0).sum())
@@ -262,7 +261,7 @@ def period(task: Task, model: Extended) -> Period:
     return Period(span / max(k, 1), chance, variance)
 
 
-# A slow wander of the power that is no cause: coal, vacuum, ambient.
+# A slow disturbance of the power that is not a cause: coal, vacuum, ambient conditions.
 
 LEAST_WANDER_GAIN = 16.0
 _WIDTHS_H = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -271,12 +270,12 @@ _WANDER_SHRINK = (0.3, 1.0, 3.0)
 
 @dataclass(frozen=True, slots=True)
 class Wander:
-    """How the level of the power wanders.
+    """The slow disturbance ("wander") of the power level.
 
     Attributes
     ----------
     gain : float
-        Log-likelihood gained on sub-blocks whose level was estimated from others.
+        Gain in log-likelihood on sub-blocks whose level was estimated from others.
     rms_mw, time_scale_s : float
     level : float64 (subs,)
         The relative level of each sub-block.
@@ -289,15 +288,15 @@ class Wander:
 
     @property
     def there(self) -> bool:
-        """Tell whether it is more than chance."""
+        """Return True if the disturbance is significant."""
         return self.gain > LEAST_WANDER_GAIN
 
 
 def wander(screening: Screening) -> Wander:
-    """Estimate the level of each sub-block from its neighbours, and what that is worth.
+    """Estimate the level of each sub-block from its neighbours, and the gain.
 
-    Kernels of several widths are tried; each sub-block is predicted without itself, so that
-    what the noise does inside it cannot pay.
+    Kernels of several widths are tried. Each sub-block is predicted without its own data, so that
+    the noise inside it gives no gain.
     """
     own, toward = screening.gain_by_sub()
     middle_h = screening.grids.sub_middle_s / 3600.0

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An alarm by ANSI/ISA-18.2: its states, the ways between them, and what is announced."""
+"""An alarm according to ANSI/ISA-18.2: its states, transitions and announcements."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class AlarmState(enum.IntEnum):
 
 
 class AlarmAction(enum.Enum):
-    """What an operator can do to alarms."""
+    """Actions of an operator on alarms."""
 
     ACKNOWLEDGE = 'acknowledge'
     SHELVE = 'shelve'
@@ -38,7 +38,7 @@ class AlarmAction(enum.Enum):
 
 
 class Priority(enum.IntEnum):
-    """How soon somebody has to look; residual alarms ask for maintenance, not for a trip."""
+    """How soon an operator must act; residual alarms ask for maintenance, not for a trip."""
 
     LOW = 1
     MEDIUM = 2
@@ -47,17 +47,17 @@ class Priority(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class AlarmChange:
-    """One change of an alarm's state, as it is announced.
+    """One announced change of the state of an alarm.
 
     Attributes
     ----------
     state, previous : AlarmState
-        From now on, and just before, whether or not that was announced; the same where one that
-        has stood for long is only told again.
+        The new state and the one before it, whether or not that one was announced. Both are
+        equal if an alarm that has been standing for long is announced again.
     occurrence : int
-        How often the condition has begun, whether or not that was announced.
+        How many times the condition has begun, whether or not that was announced.
     first_out : str
-        The alarm that came first of those that stand; empty if none stands.
+        The standing alarm that was raised first; empty if none stands.
     """
 
     time_ns: int
@@ -75,7 +75,7 @@ class AlarmChange:
     first_out: str = ''
 
     def snapshot(self) -> State:
-        """Return it as plain values."""
+        """Return the change as plain values."""
         numbers = {name: int(getattr(self, name)) for name in ('state', 'previous', 'priority')}
         return {**asdict(self), **numbers}
 
@@ -87,7 +87,7 @@ class AlarmChange:
 
 
 class Judged(NamedTuple):
-    """A moment, the evidence then, and the shift it speaks of."""
+    """A time, the evidence at that time, and the corresponding shift."""
 
     time_ns: int
     evidence: float
@@ -95,22 +95,22 @@ class Judged(NamedTuple):
 
 
 class AlarmStateMachine(Memory):
-    """Keep the state of one alarm; know neither why it comes nor who is told.
+    """Keep the state of one alarm, independent of its cause and its announcements.
 
-    Three layers lie upon one another: the condition with its acknowledgement, suppression while
-    it cannot be judged, and the shelf. The upper one shows, and the lower ones live on below it,
-    so that nothing is lost when it is taken away.
+    There are three layers: the condition with its acknowledgement, suppression while the alarm
+    cannot be judged, and shelving. The topmost layer determines the visible state. The lower ones
+    are still updated, so that nothing is lost when an upper one ends.
 
     Attributes
     ----------
     active : bool
-        Whether the condition holds.
+        True if the condition holds.
     occurrence : int
-        How often it has begun.
+        How many times the condition has begun.
     raised_ns : int
-        When it began last; 0 before.
+        Time when it last began; 0 if never.
     shelved_until_ns : int or None
-        When the shelf lets it go by itself; None if it is not shelved.
+        Time when the shelving ends automatically; None if it is not shelved.
     """
 
     REMEMBERED: ClassVar[tuple[str, ...]] = (
@@ -127,31 +127,31 @@ class AlarmStateMachine(Memory):
 
     @property
     def state(self) -> AlarmState:
-        """Return the state that shows."""
+        """Return the visible state."""
         if self.shelved_until_ns is not None:
             return AlarmState.SHELVED
         return AlarmState.SUPPRESSED if self.suppressed else self._below
 
     @property
     def standing(self) -> bool:
-        """Tell whether it has come and is not cleared, shelved and suppressed ones included."""
+        """Return True if it was raised and is not cleared, even if shelved or suppressed."""
         return self._below != AlarmState.NORMAL
 
     def begin(self, time_ns: int) -> None:
-        """Let the condition begin."""
+        """Start the condition."""
         self.active = True
         self.occurrence += 1
         self.raised_ns = time_ns
         self._below = AlarmState.UNACKNOWLEDGED
 
     def end(self, latch: bool) -> None:
-        """Let the condition end; latched, it waits for who has not acknowledged it yet."""
+        """End the condition; a latched alarm then waits for its acknowledgement."""
         self.active = False
         waits = latch and self._below == AlarmState.UNACKNOWLEDGED
         self._below = AlarmState.RETURNED_UNACKNOWLEDGED if waits else AlarmState.NORMAL
 
     def acknowledge(self) -> bool:
-        """Acknowledge what shows; tell whether there was anything to acknowledge."""
+        """Acknowledge the visible state; return True if there was something to acknowledge."""
         if self.state == AlarmState.UNACKNOWLEDGED:
             self._below = AlarmState.ACKNOWLEDGED
         elif self.state == AlarmState.RETURNED_UNACKNOWLEDGED:
@@ -161,14 +161,14 @@ class AlarmStateMachine(Memory):
         return True
 
     def shelve(self, until_ns: int) -> bool:
-        """Put it aside if it stands; one that is shelved already stays so no longer for it."""
+        """Shelve the alarm if it stands; the end of an earlier shelving is not changed."""
         if not self.standing or self.shelved_until_ns is not None:
             return False
         self.shelved_until_ns = until_ns
         return True
 
     def unshelve(self) -> bool:
-        """Take it from the shelf: to be acknowledged if the condition holds, or else cleared."""
+        """Unshelve it: unacknowledged if the condition holds, otherwise cleared."""
         if self.shelved_until_ns is None:
             return False
         self.shelved_until_ns = None
@@ -176,7 +176,7 @@ class AlarmStateMachine(Memory):
         return True
 
 
-# How often one alarm may be announced: a chattering one must not bury the others.
+# Rate limit of the announcements of one alarm: a chattering alarm must not hide the others.
 
 _WINDOW_NS = 600 * NS_PER_S
 # Three announcements within a minute are chattering.
@@ -185,16 +185,16 @@ _CHATTER = 3
 
 
 class FloodLimit(Memory):
-    """Count the announcements of one alarm in the samples' own time.
+    """Limit the announcements of one alarm, based on the time of the samples.
 
-    The first one always passes: only what was said shortly before can hold another back.
+    The first one always passes: only recent announcements can hold another one back.
 
     Attributes
     ----------
     most : int
-        Announcements that may fall within ten minutes.
+        Maximum number of announcements within ten minutes.
     held : int
-        How many were held back since the last one that passed.
+        Number of announcements held back since the last one that passed.
     """
 
     REMEMBERED = ('held', '_times_ns')
@@ -206,7 +206,7 @@ class FloodLimit(Memory):
 
     @property
     def free_ns(self) -> int | None:
-        """Return from when on the next may pass; None if at any time."""
+        """Return the time from which the next one may pass; None if at any time."""
         times = self._times_ns
         free = [
             times[-count] + span
@@ -216,28 +216,28 @@ class FloodLimit(Memory):
         return max(free, default=None)
 
     def allows(self, time_ns: int) -> bool:
-        """Tell whether an announcement may pass."""
+        """Return True if an announcement may pass."""
         free_ns = self.free_ns
         return free_ns is None or time_ns >= free_ns
 
     def passed(self, time_ns: int) -> None:
-        """Note an announcement that was made."""
+        """Record an announcement."""
         self._times_ns = [t for t in self._times_ns if t > time_ns - _WINDOW_NS] + [time_ns]
 
     def shift(self, step_ns: int) -> None:
-        """Follow a clock that was set by a step, so that no time is waited for twice."""
+        """Shift the stored times by a step of the clock, so that no waiting time is repeated."""
         self._times_ns = [t + step_ns for t in self._times_ns]
 
 
 _LAST_NS = (1 << 63) - 1
-# What has stood so long since it was told is told again, so that no shift takes it for old news.
+# A standing alarm is repeated after this time, so that every shift sees a recent announcement.
 _AGAIN_NS = 86_400 * NS_PER_S
-# So many announcements of others bury one that is not over: it is told again after them.
+# An alarm that is not cleared is repeated after this many announcements of other alarms.
 BURIED = 8
 
 
 class Content(NamedTuple):
-    """What an alarm was judged by, and a sentence about it."""
+    """The value and limit of an alarm, and a sentence about it."""
 
     value: float
     limit: float
@@ -248,21 +248,21 @@ class Content(NamedTuple):
 class Alarm(AlarmStateMachine, ABC):
     """An alarm whose changes are announced.
 
-    The state is always true; what is announced follows it, held back by the flood limit. What was
-    held back and stands is announced as soon as the limit lets it, and the next announcement tells
-    how many were missed. What stands for a day, shelved or suppressed or not, is announced again,
-    and so is what is not over when others have been announced `BURIED` times since: who comes late
-    is given only the newest announcements. Neither counts for the limit, which is for what is new.
+    The state is always up to date; announcements follow it within the flood limit. A state that
+    was held back is announced as soon as the limit allows, and the next announcement gives the
+    number of missed ones. A standing alarm (also if shelved or suppressed) is announced again
+    after a day, or after `BURIED` announcements of others, as late subscribers get only the newest
+    ones. These repetitions do not count for the limit, which applies to changes.
 
     Parameters
     ----------
     settings : Settings
-        Latch, time on the shelf, flood limit.
+        Latch, shelving time, flood limit.
 
     Attributes
     ----------
     last : AlarmChange or None
-        What was announced last.
+        The last announcement.
     """
 
     NAME = ''
@@ -278,59 +278,59 @@ class Alarm(AlarmStateMachine, ABC):
         self._told = self._now = self._before = AlarmState.NORMAL
         self._waits = False
         self._told_ns = 0
-        self._others = 0  # announcements of other alarms since it was told
+        self._others = 0  # announcements of other alarms since the last one of this alarm
         self.last: AlarmChange | None = None
         self._beside: Sequence[Alarm] = (self,)
         self.configure(settings)
 
     def configure(self, settings: Settings) -> None:
-        """Take new settings; states and counters stay."""
+        """Apply new settings; states and counters stay."""
         self._latch = settings.flag('alarm_latch')
         self._shelf_ns = round(settings.real('alarm_shelve_time') * NS_PER_S)
         self._flood.most = settings.whole('alarm_flood')
 
     @abstractmethod
     def _content(self, state: AlarmState) -> Content:
-        """Return what there is to say in a state of the condition."""
+        """Return value, limit and sentence for a state of the condition."""
 
     @abstractmethod
     def _blind(self) -> str:
-        """Say why it cannot be judged."""
+        """Return why it cannot be judged."""
 
     @property
     def held(self) -> int:
-        """Return how many announcements the flood limit has held back since the last one."""
+        """Return the number of announcements held back since the last one."""
         return self._flood.held
 
     @property
     def due_ns(self) -> int | None:
-        """Return when something happens without a cause from outside; None if never."""
+        """Return the time of the next change or repetition due to time alone; None if never."""
         if self._waits:
-            # None: the limit was raised meanwhile, and it may go out at once.
+            # None: the limit was raised meanwhile, so the announcement may pass now.
             return self._flood.free_ns or 0
         due = (self.shelved_until_ns, self._again_ns)
         return min((ns for ns in due if ns is not None), default=None)
 
     @property
     def _again_ns(self) -> int | None:
-        """Return when it is to be told again; None if there is nothing that could be forgotten."""
+        """Return the time of the next repetition; None if there is none."""
         if self._others >= BURIED and self._told != AlarmState.NORMAL:
             return self._told_ns
         return self._told_ns + _AGAIN_NS if self.standing else None
 
     def stand_beside(self, alarms: Sequence[Alarm]) -> None:
-        """Know the others, and this one among them, to tell which came first."""
+        """Set the list of all alarms, including this one, to find which was raised first."""
         self._beside = tuple(alarms)
 
     def pass_time(self, time_ns: int, model_id: str) -> list[AlarmChange]:
-        """Do what is due; return the change that makes, if any."""
+        """Perform time-dependent changes; return the announcement, if any."""
         until_ns = self.shelved_until_ns
         if until_ns is not None and time_ns >= until_ns:
             self.unshelve()
         return self._tell(time_ns, model_id)
 
     def shift_time(self, step_ns: int) -> None:
-        """Follow a clock that was set back, so that no shelf outlives its time."""
+        """Shift the stored times after a step of the clock, so that shelving ends in time."""
         self._flood.shift(step_ns)
         self._told_ns += step_ns
         if self.shelved_until_ns is not None:
@@ -339,9 +339,9 @@ class Alarm(AlarmStateMachine, ABC):
     def operate(
         self, action: AlarmAction, time_ns: int, model_id: str
     ) -> tuple[bool, list[AlarmChange]]:
-        """Do what an operator asks; return whether it could be done, and the change announced.
+        """Perform the action of an operator; return whether it was possible, and the announcement.
 
-        There may be none to announce: what was said before may still be true, or the flood limit
+        There may be no announcement: the announced state may still be valid, or the flood limit
         holds it back.
         """
         if action is AlarmAction.ACKNOWLEDGE:
@@ -353,7 +353,7 @@ class Alarm(AlarmStateMachine, ABC):
         return done, self._tell(time_ns, model_id) if done else []
 
     def _tell(self, time_ns: int, model_id: str) -> list[AlarmChange]:
-        """Announce the state, unless that was done or is held back."""
+        """Announce the state, unless it was announced already or is held back."""
         state = self.state
         if state != self._now:
             self._before, self._now = self._now, state
@@ -373,7 +373,7 @@ class Alarm(AlarmStateMachine, ABC):
         missed = self._flood.held
         if state == AlarmState.UNACKNOWLEDGED and not again:
             self._flood.passed(time_ns)
-            # What is announced late is not missed.
+            # A delayed announcement is not a missed one.
             missed -= 1 if self._waits else 0
         self._flood.held, self._waits = 0, False
         previous = state if again else self._before
@@ -394,13 +394,13 @@ class Alarm(AlarmStateMachine, ABC):
         return self.last
 
     def _crowd_out(self) -> None:
-        """Let the others know that there is one announcement more after theirs."""
+        """Count this announcement in the other alarms."""
         for alarm in self._beside:
             alarm._others += 1
         self._others = 0
 
     def _worded(self, state: AlarmState, previous: AlarmState, sentence: str) -> str:
-        """Return the sentence, with what shelf and suppression have to do with it."""
+        """Return the sentence, with the effect of shelving and suppression."""
         until_ns = self.shelved_until_ns
         if until_ns is not None:
             return f'Shelved until {_utc(until_ns)}; new alarms are not hidden.'
@@ -415,22 +415,22 @@ class Alarm(AlarmStateMachine, ABC):
         return sentence
 
     def _first_out(self) -> str:
-        """Name the alarm that came first of those that stand."""
+        """Return the name of the standing alarm that was raised first."""
         standing = [alarm for alarm in self._beside if alarm.standing]
         return min(standing, key=lambda alarm: alarm.raised_ns).NAME if standing else ''
 
     def snapshot(self) -> State:
-        """Return what is remembered, the last announcement among it."""
+        """Return the state, including the last announcement."""
         return {**super().snapshot(), 'last': self.last and self.last.snapshot()}
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; in those of version 1 the machine's own part stands in another."""
+        """Continue from a saved state; version 1 stores the state machine under another key."""
         super().restore({**saved.get('life', {}), **saved})
         self.last = saved['last'] and AlarmChange.restored(saved['last'])
 
 
 def _missed(count: int) -> str:
-    """Say how many announcements were held back."""
+    """Return a sentence with the number of announcements that were held back."""
     if count <= 0:
         return ''
     return (

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The alarms of the monitor: on the residual, on a shift of the curve, and both in one list."""
+"""The alarms of the monitor: on the residual and on a shift of the curve; the list of both."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
 __all__ = ['AlarmChange', 'AlarmState', 'Judged', 'Priority', 'ResidualAlarm']
 
 _LIMIT = 1.0
-# Places in the alarm's memory: the condition, the delay that runs, the time of the last row; how
-# long nothing could be judged and how long it could be again, and whether it is suppressed for it;
-# what happened at the last row, and the step of time before it; when there was no evidence last.
+# Indices of the alarm state: condition, start of the running delay, delay running, time of the
+# last row; time without judgement, time with judgement, suppressed; events at the last row, time
+# step before it; last time without evidence.
 _ACTIVE, _SINCE, _COUNTING, _LAST_NS, _BLIND, _SIGHT, _DARK, _WHAT, _STEP, _CALM_NS = range(10)
 _PLACES = 10
-# The evidence began to gather when it was last below this share of the limit.
+# The onset is the last time when the evidence was below this fraction of the limit.
 _CALM = 0.25
-# The alarm comes back to sight when it could be judged for at most so many blocks.
+# Suppression ends after at most this many blocks that can be judged.
 _BLOCKS_TO_SEE = 5.0
-# An alarm that comes back within so many delays of a return is the one that was there; its delay
-# doubles then, up to this factor.
+# An alarm within this many return delays after the last return continues the earlier one; its
+# return delay is then doubled, up to this factor.
 _SOON, _LONGEST = 7, 8
-# What happened, as bits.
+# Events at a row, as bits.
 _TURNED, _DARKENED, _SEEING, _SET_BACK, _DUE = 1, 2, 4, 8, 16
 _NEVER = (1 << 63) - 1
 
@@ -60,7 +60,7 @@ def _turns(
     off_ns: int,
     memory: IntArray,
 ) -> bool:
-    """Judge one value; tell whether the condition turned."""
+    """Judge one value; return True if the condition changed."""
     if memory[_ACTIVE] == 0:
         beyond = v > limit
         delay = on_ns
@@ -84,11 +84,11 @@ def _turns(
 def _sight(
     judged: bool, turned: bool, watched_ns: int, dark_ns: int, back_ns: int, memory: IntArray
 ) -> int:
-    """Follow how long the alarm has been blind, or could see again; return what that brings.
+    """Update how long the alarm could not, or could, be judged; return the resulting event.
 
-    Each takes back from the other, so that a single row on either side decides nothing; who has
-    seen for long enough has not been blind. Time that nobody watched does not count: a silence
-    alone suppresses nothing.
+    Each time reduces the other one, so that a single row has no effect; after enough time with
+    judgement, the time without it is reset. Gaps do not count: missing rows alone do not suppress
+    the alarm.
     """
     if not judged:
         memory[_SIGHT] = max(0, memory[_SIGHT] - watched_ns)
@@ -108,7 +108,7 @@ def _sight(
 
 @jit
 def _elsewhere(v: float, u: float, limit: float, dead_band: float, span: FloatArray) -> bool:
-    """Follow from which u to which the condition was seen; tell if a calm row lies outside."""
+    """Update the range of u where the condition was seen; return True for a calm row outside."""
     if v > limit:
         span[0], span[1] = min(span[0], u), max(span[1], u)
     return v < limit * (1.0 - dead_band) and not span[0] <= u <= span[1]
@@ -130,12 +130,12 @@ def _watch(
     memory: IntArray,
     span: FloatArray,
 ) -> int:
-    """Run until something happens; return the row after it, or 0.
+    """Process rows until an event; return the index of the row after it, or 0.
 
-    NaN leaves the condition as it is: bad data neither raise nor clear. A delay
-    does not run through a gap in time, where nobody was watching, and a return is
-    judged only where the condition was seen: what is wrong at full load is not over
-    because the unit runs at half.
+    NaN does not change the condition: bad data neither raise nor clear the alarm. A
+    delay does not run through a gap in time. A return is judged only in the range of
+    u where the condition was seen: a fault at full load does not end because
+    the unit runs at half load.
     """
     for t in range(value.size):
         step_ns = time_ns[t] - memory[_LAST_NS]
@@ -155,7 +155,7 @@ def _watch(
         elif judged and not _elsewhere(v, u[t], limit, dead_band, span):
             turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)
         else:
-            # Delays stand still while there is nothing to judge.
+            # Delays pause while there is nothing to judge.
             memory[_SINCE] += step_ns
         what = _sight(judged, turned, step_ns if watched else 0, dark_ns, back_ns, memory)
         if turned:
@@ -171,27 +171,27 @@ def _watch(
 
 
 class ResidualAlarm(Alarm):
-    """Judge the evidence that the plant has left the curve: beyond 1 or -1 it has.
+    """Raise an alarm if the evidence that the plant has left the curve is beyond 1 or -1.
 
-    Where the evidence cannot be judged for long, the alarm is suppressed. By ISA-18.2 that is no
-    annunciation, and it must not flutter: a valve that runs beyond the curve for some minutes,
-    some times a day, suppresses nothing. The alarm comes back when the evidence could be judged
-    for some blocks, less what could not, and at once if the condition turns.
-    The condition is over only where it was seen: the delay of a return does not run at other u.
-    What comes and goes is one thing: who comes back soon after a return has to stay away for twice
-    as long the next time.
+    If the evidence cannot be judged for a long time, the alarm is suppressed. In ISA-18.2 terms it
+    is then not annunciated. Suppression must not chatter: a few minutes outside the curve, several
+    times a day, have no effect. It ends when the evidence could be judged for several blocks, net
+    of the time when it could not, or at once if the condition changes.
+    The condition ends only in the range of u where it was seen: elsewhere the return delay pauses.
+    An alarm that comes back soon after a return counts as the same one: each time its return delay
+    is doubled.
 
     Parameters
     ----------
     settings : Settings
-        Delays, dead band, latch, time on the shelf, flood limit.
+        Delays, dead band, latch, shelving time, flood limit.
 
     Attributes
     ----------
     judged : Judged
-        What the next change speaks of.
+        Time, evidence and shift for the next announcement.
     onset_ns : int
-        When the evidence for the last occurrence began to gather; 0 before.
+        Time when the evidence for the last occurrence began to grow; 0 if none.
     """
 
     NAME = 'residual'
@@ -205,27 +205,27 @@ class ResidualAlarm(Alarm):
         self._span = np.zeros(2)
         self.onset_ns = 0
         self._returned_ns: int | None = None
-        self._longer = 1  # the delay of a return, in units of the parameter
-        self._left_mw = 0.0  # how far the unit was from the curve when the alarm came
+        self._longer = 1  # factor of the return delay
+        self._left_mw = 0.0  # difference from the curve when the alarm was raised
         self.judged = Judged(0, math.nan, math.nan)
         super().__init__(settings)
 
     def configure(self, settings: Settings) -> None:
-        """Take new settings; states and counters stay."""
+        """Apply new settings; states and counters stay."""
         super().configure(settings)
         self._dead_band = settings.real('alarm_dead_band')
         self._on_ns = round(settings.real('alarm_on_delay') * NS_PER_S)
         self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
         self._gap_ns = round(1.5 * settings.real('sample_period') * NS_PER_S)
         self._dark_ns = round(settings.real('alarm_suppress_time') * NS_PER_S)
-        # At least a block, for evidence from before it is of old data; but a return of the
-        # condition may have to last for a day, which nobody is to be blind for.
+        # At least one block, because earlier evidence contains old data. The return delay may be a
+        # day, but the suppression must not last that long.
         block_s = settings.real('alarm_block')
         lasting_s = min(settings.real('alarm_off_delay'), _BLOCKS_TO_SEE * block_s)
         self._back_ns = round(max(block_s, lasting_s) * NS_PER_S)
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; one of an earlier version does not know where it was seen."""
+        """Continue from a saved state; earlier versions did not store the range of u."""
         saved = {
             'returned_ns': None,
             'longer': 1,
@@ -242,7 +242,7 @@ class ResidualAlarm(Alarm):
         super().restore(saved)
 
     def reset(self, time_ns: int, model_id: str) -> list[AlarmChange]:
-        """Let the condition be over, as with a new reference."""
+        """End the condition, as after a new reference."""
         self._returned_ns, self._longer = None, 1
         if not self.active:
             return []
@@ -266,14 +266,14 @@ class ResidualAlarm(Alarm):
         ----------
         time_ns : int64 (n,)
         evidence : float64 (n,)
-            NaN where there is nothing to judge.
+            NaN if there is nothing to judge.
         shift_mw : float64 (n,)
-            The shift it speaks of, for the sentence.
+            The shift that corresponds to the evidence, for the sentence.
         model_id : str
         beside : sequence of Alarm
-            Others, for which the time passes row by row as well.
+            Other alarms, whose time advances row by row as well.
         u : float64 (n,), optional
-            Where on the curve the unit is.
+            Position of the unit on the curve.
         """
         u = np.zeros(len(time_ns)) if u is None else u
         changes: list[tuple[int, AlarmChange]] = []
@@ -297,13 +297,13 @@ class ResidualAlarm(Alarm):
         return changes
 
     def shift_time(self, step_ns: int) -> None:
-        """Follow a clock that was set back."""
+        """Shift the stored times after a step of the clock."""
         super().shift_time(step_ns)
         if self._returned_ns is not None:
             self._returned_ns += step_ns
 
     def _happened(self, now_ns: int, everyone: Sequence[Alarm]) -> None:
-        """Let lives go on by what happened at a row."""
+        """Update the alarms for the events at a row."""
         what = int(self._memory[_WHAT])
         if what & _SET_BACK:
             for alarm in everyone:
@@ -343,7 +343,7 @@ class ResidualAlarm(Alarm):
 
 
 def _sentence(state: AlarmState, shift_mw: float) -> str:
-    """Say what happened in words an operator can act on."""
+    """Return a sentence about the change that tells an operator what to do."""
     side = 'more' if shift_mw > 0.0 else 'less'
     known = abs(shift_mw) > 0.0
     if state == AlarmState.UNACKNOWLEDGED and not known:
@@ -362,42 +362,42 @@ def _sentence(state: AlarmState, shift_mw: float) -> str:
     return 'The unit follows the valve curve.'
 
 
-# The alarm on a shift of the curve: the states of the residual alarm, one judgement a curve.
+# The alarm on a shift of the curve: states as for the residual alarm, one judgement per curve.
 
 
-# A shift that was seen is over only when it is ten times less sure than it had to be.
+# A reported shift ends only when its p-value exceeds ten times the limit for reporting it.
 _DOUBT = 10.0
-# Share of a moved piece that must be judged unmoved: the ends of a curve, and its knots, lie
-# a little elsewhere in every window.
+# Fraction of a shifted piece that must be judged as not shifted: the ends and the breakpoints of
+# the curve differ slightly from window to window.
 _COVERED = 0.8
-# A shift has another size than was told if it differs by this share, and by two of its errors,
-# which are about half of the smallest shift that is seen.
+# A shift is announced again if its size changes by this fraction and by two standard errors, which
+# are about half of the smallest detectable shift.
 _ANOTHER = 0.25
-# A shift so many times as large as the smallest that is seen needs no second curve.
+# A shift larger than this multiple of the smallest detectable one needs no second curve.
 _CLEAR = 2.0
-# Two pieces are one for that if they share so much of the shorter one.
+# Two pieces count as the same if they share this fraction of the shorter one.
 _OVERLAP = 0.5
-# Judgements are two if so many periods of the refits lie between them: one fit takes longer.
+# Judgements are independent after this fraction of the refit period (< 1, as fits take time).
 _APART = 0.9
 _SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
 class ShiftAlarm(Alarm):
-    """Follow the judgements of adopted curves against the reference.
+    """Raise an alarm if adopted curves differ from the reference.
 
     Notes
     -----
-    ISA-18.2 states as of the residual alarm, but without delays: a curve stands on days of data,
-    and for the same reason it is suppressed by a curve that cannot be judged, not by minutes of
-    bad data. Two judgements in a row have to see it, unless it is large. A piece that moved and
-    left the window with its load is not known to be back: the alarm stands until its u are judged
-    again, or until there is a new reference. It is announced again where its size turns out to be
-    another: the first curves after a change know little.
+    The states are those of ISA-18.2, as for the residual alarm, but without delays: a curve is
+    based on days of data. So it is suppressed if a curve cannot be judged, not by minutes of bad
+    data. Two consecutive judgements must find the shift, unless it is large. If the loads in the
+    window no longer cover a shifted piece, the alarm stands until its range of u is judged again,
+    or until a new reference is set. The alarm is announced again if the size of the shift changes:
+    the first curves after a change are inaccurate.
 
     Parameters
     ----------
     settings : Settings, optional
-        Those given with a judgement are taken from then on.
+        Settings given with a later judgement replace them.
     """
 
     NAME = 'curve_shift'
@@ -412,20 +412,20 @@ class ShiftAlarm(Alarm):
         self._sentence = ''
         self._problem = ''
         self._ranges: list[tuple[float, float]] = []
-        self._seen: list[list[float]] = []  # u and MW of what the last judgement saw moved
+        self._seen: list[list[float]] = []  # u and MW of the shifted pieces at the last judgement
         self._seen_ns = 0
         super().__init__(settings or Settings())
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """Return from which u to which u pieces moved that were not judged unmoved since."""
+        """Return the ranges of u of shifted pieces that were not judged as unshifted since."""
         return tuple((low, high) for low, high in self._ranges)
 
     def judge(self, shift: Shift, time_ns: int, settings: Settings) -> list[AlarmChange]:
-        """Take a judgement; return the change it makes, if any."""
+        """Process a judgement; return the resulting change, if any."""
         self.configure(settings)
         self.suppressed = False
-        # A curve that was asked for soon after another stands on nearly the same data.
+        # Two curves requested within a short time use nearly the same data.
         another = time_ns - self._seen_ns >= _APART * settings.real('refit_period') * NS_PER_S
         if not self.active and self._confirmed(shift, self._seen if another else []):
             self.begin(time_ns)
@@ -439,20 +439,20 @@ class ShiftAlarm(Alarm):
     def unjudged(
         self, problem: str, time_ns: int, model_id: str, settings: Settings
     ) -> list[AlarmChange]:
-        """Be suppressed, since a curve could not be judged, until the next one is."""
+        """Suppress the alarm, because a curve could not be judged, until the next judgement."""
         self.configure(settings)
         self._problem = problem
         self.suppressed = True
         return self._tell(time_ns, model_id)
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; those of earlier versions began with the first judgement."""
+        """Continue from a saved state; earlier versions have no stored judgement."""
         super().restore({'seen': [], 'seen_ns': 0, **saved})
 
     def reset(
         self, sentence: str, time_ns: int, model_id: str, settings: Settings
     ) -> list[AlarmChange]:
-        """Let the condition be over, as with a new reference."""
+        """End the condition, as after a new reference."""
         self.configure(settings)
         self.suppressed = False
         self.forget()
@@ -462,7 +462,7 @@ class ShiftAlarm(Alarm):
 
     @property
     def _again_ns(self) -> int | None:
-        """Return when it is to be told again: at once, if its size is not what was told."""
+        """Return the time of the next repetition: now, if the announced size is out of date."""
         told = self.last
         if self.active and told is not None and self.state == told.state in _SHOWN:
             surely = max(_ANOTHER * abs(told.value), 0.5 * self._limit)
@@ -471,12 +471,12 @@ class ShiftAlarm(Alarm):
         return super()._again_ns
 
     def shift_time(self, step_ns: int) -> None:
-        """Follow a clock that was set back."""
+        """Shift the stored times after a step of the clock."""
         super().shift_time(step_ns)
         self._seen_ns += step_ns
 
     def forget(self) -> None:
-        """Let the last judgement confirm nothing, as it was one against another reference."""
+        """Forget the last judgement, because it referred to another reference."""
         self._seen = []
 
     def _end(self, sentence: str) -> None:
@@ -486,7 +486,7 @@ class ShiftAlarm(Alarm):
         self.end(self._latch)
 
     def _follow(self, shift: Shift, settings: Settings) -> None:
-        """Take the size of the shift, and let it end where it is known to be over."""
+        """Update the size of the shift; end the condition if it is over."""
         worst = shift.largest
         if worst is not None:
             self._value, self._limit = worst.shift_mw, worst.smallest_mw
@@ -497,7 +497,7 @@ class ShiftAlarm(Alarm):
             self._end(shift.sentence)
 
     def _confirmed(self, shift: Shift, seen: list[list[float]]) -> bool:
-        """Tell whether a piece moved that was seen moved before, or moved by very much."""
+        """Return True if a piece is shifted as in the last judgement, or by a large amount."""
         return any(
             abs(p.shift_mw) > _CLEAR * p.smallest_mw
             or any(
@@ -511,7 +511,7 @@ class ShiftAlarm(Alarm):
         )
 
     def _remember(self, shift: Shift, settings: Settings) -> None:
-        """Remember the ranges that moved; forget older ones that are judged anew."""
+        """Store the ranges that shifted; remove older ones that were judged again."""
         settled = [
             p for p in shift.pieces
             if p.moved or (math.isfinite(p.smallest_mw) and not _stands(p, settings))
@@ -533,14 +533,14 @@ class ShiftAlarm(Alarm):
 
 
 def _covered(span: tuple[float, float], pieces: list[PieceShift]) -> bool:
-    """Tell whether pieces cover nearly all of a range of u."""
+    """Return True if pieces cover nearly all of a range of u."""
     low, high = span
     inside = sum(max(0.0, min(p.u_to, high) - max(p.u_from, low)) for p in pieces)
     return inside >= _COVERED * (high - low)
 
 
 def _stands(piece: PieceShift, settings: Settings) -> bool:
-    """Tell whether a shift that was seen before is still there."""
+    """Return True if a shift that was seen before is still there."""
     chance = min(1.0, _DOUBT * (1.0 - settings.real('shift_confidence')))
     least = (1.0 - settings.real('alarm_dead_band')) * settings.real('shift_least')
     return piece.p_value < chance and abs(piece.shift_mw) >= least
@@ -574,12 +574,12 @@ class Alarms:
             alarm.stand_beside(self._all)
 
     def configure(self, settings: Settings) -> None:
-        """Take new settings; states and counters stay."""
+        """Apply new settings; states and counters stay."""
         for alarm in self._all:
             alarm.configure(settings)
 
     def feed(self, block: PredictionBlock) -> list[AlarmChange]:
-        """Judge predicted rows; return what changes, in the order of the rows."""
+        """Judge predicted rows; return the changes in the order of the rows."""
         judged = np.where(np.isfinite(block.residual_mw), block.evidence, np.nan)
         changes = self._residual.feed(
             block.time_ns, judged, block.shift_mw, block.model_id, [self._shift], block.u
@@ -589,22 +589,22 @@ class Alarms:
     def operate(
         self, action: AlarmAction, judged: Judged, model_id: str, name: str | None = None
     ) -> list[AlarmChange]:
-        """Do to every alarm, or to one, what an operator asks; return what is announced.
+        """Apply an operator action to one alarm or to all; return the announcements.
 
         Parameters
         ----------
         action : AlarmAction
         judged : Judged
-            What was judged last.
+            The last judged time, evidence and shift.
         model_id : str
-            The curve it was judged by.
+            Identifier of the curve used for it.
         name : str, optional
-            Of the alarm; all without it.
+            Name of the alarm; None for all.
 
         Raises
         ------
         DataError
-            There is no alarm of that name, or none to which that can be done.
+            There is no alarm of that name, or the action applies to none of them.
         """
         meant = [alarm for alarm in self._all if name in (None, alarm.NAME)]
         if not meant:

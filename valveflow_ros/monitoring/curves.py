@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The curve of the last fit, the one that predicts, and when the next fit is asked for."""
+"""The curve of the last fit, the predicting curve, and the time of the next fit."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from valveflow_ros.records import NS_PER_S, ByteArray, IntArray
 from valveflow_ros.segments.window import RollingWindow
 from valveflow_ros.state import Memory, State
 
-# What the running curve is worth.
+# The status of the running curve.
 
 
 class CurveStatus(enum.IntEnum):
-    """What can be said of the running curve; the same numbers stand in the message.
+    """The status of the running curve; the message uses the same numbers.
 
     `STALE`: there is a curve, but the last fit was refused or the clock went
-    back. `REFUSED`: there is none, and the last fit was refused. `PROVISIONAL`: it is made from
-    the rows since something went wrong, which is not the plant in health.
+    back. `REFUSED`: there is no curve, and the last fit was refused. `PROVISIONAL`: the curve is
+    fitted to rows since the onset of a fault, not to the healthy plant.
     """
 
     UNKNOWN = 0
@@ -38,8 +38,8 @@ class CurveStatus(enum.IntEnum):
 class RunningCurve:
     """Holds the curve of the last fit, and the predictor.
 
-    Predictions come from the reference once there is one: a curve that is fitted to a fault
-    would call it health.
+    If there is a reference, it gives the predictions: a curve fitted to a fault would hide the
+    fault.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ class RunningCurve:
     Attributes
     ----------
     characteristic : Characteristic or None
-        Of the last fit.
+        The curve of the last fit.
     status : CurveStatus
     cause : str
-        Why there is no curve, or only a stale or provisional one; empty if it is fresh.
+        Why there is no curve, or only a stale or provisional one; empty if it is up to date.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -63,26 +63,26 @@ class RunningCurve:
 
     @property
     def predicting(self) -> Characteristic | None:
-        """Return the curve that predicts."""
+        """Return the curve used for predictions."""
         return None if self._predictor is None else self._predictor.characteristic
 
     def configure(self, settings: Settings) -> None:
-        """Take settings of which only live ones differ."""
+        """Apply settings in which only live parameters differ."""
         self._settings = settings
         if self._predictor is not None:
             self._predictor.configure(settings)
 
     def adopt(self, characteristic: Characteristic, provisional: str = '') -> None:
-        """Hold the curve of a fit; ``provisional`` says what it is no curve of health for."""
+        """Store the curve of a fit; ``provisional`` says why the plant was not healthy."""
         self.characteristic, self.cause = characteristic, provisional
         self.status = CurveStatus.PROVISIONAL if provisional else CurveStatus.FRESH
 
     def predict_from(
         self, curve: Characteristic, window: RollingWindow, *, afresh: bool = False
     ) -> None:
-        """Predict from another curve.
+        """Use another curve for predictions.
 
-        The evidence that the last one had gathered stays, unless it is to begin afresh.
+        The accumulated evidence is kept, unless ``afresh`` is given.
         """
         before, self._predictor = self._predictor, Predictor.of(curve, self._settings)
         if before is not None and not afresh:
@@ -90,25 +90,25 @@ class RunningCurve:
         self._predictor.warm_up(*window.tail(self._predictor.warm_up_rows))
 
     def refuse(self, reason: str) -> None:
-        """Keep the old curve as stale, if there is one."""
+        """Mark the old curve as stale, if there is one."""
         self.status = CurveStatus.REFUSED if self.characteristic is None else CurveStatus.STALE
         self.cause = reason
 
     def restart(self, reason: str) -> None:
-        """Begin anew with the curve there is, after the clock went back."""
+        """Restart the prediction with the current curve, after the clock went back."""
         if self._predictor is not None:
             self._predictor = Predictor.of(self._predictor.characteristic, self._settings)
             self.status, self.cause = CurveStatus.STALE, reason
 
     def predict(self, rows: Rows, kinds: ByteArray) -> PredictionBlock:
-        """Predict rows; ``kinds`` are the segmenter's."""
+        """Predict rows; ``kinds`` are those of the segmenter."""
         columns = rows.time_ns, rows.u, rows.power_mw, kinds
         if self._predictor is None:
             return rows.shown(no_prediction(*columns))
         return rows.shown(self._predictor.predict(*columns, rows.opening_percent))
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state."""
         predictor, curve = self._predictor, self.characteristic
         return {
             'curve': None if curve is None else to_json(curve),
@@ -119,10 +119,10 @@ class RunningCurve:
         }
 
     def restore(self, saved: State) -> None:
-        """Go on from a snapshot; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         if saved['curve'] is not None:
             self.characteristic = from_json(saved['curve'])
-        # In states of earlier versions the running curve predicts.
+        # In states of earlier versions the running curve gives the predictions.
         predicting = saved.get('predicting', saved['curve'])
         if predicting is not None:
             self._predictor = Predictor.of(from_json(predicting), self._settings)
@@ -131,13 +131,13 @@ class RunningCurve:
         self.status, self.cause = CurveStatus(saved['status']), saved['cause']
 
 
-# When a fit is to be asked for, and which outcome is awaited.
+# Time of the next fit request, and the pending request.
 
 
 class Refits(Memory):
-    """Counts segments and time towards the next request, and names requests.
+    """Count segments and time until the next request, and name requests.
 
-    A request's name is the time of the row after which it was made.
+    The name of a request is the time of the last row before it.
     """
 
     REMEMBERED = (
@@ -154,12 +154,12 @@ class Refits(Memory):
         self.segments_seen = 0
 
     def rows_until_due(self, time_ns: IntArray, settings: Settings) -> tuple[int, bool]:
-        """Return how many rows to take before the period is over, and whether it is among them."""
+        """Return the number of rows up to the end of the period, and whether it is among them."""
         if self._last_ns is None:
             self._last_ns = int(time_ns[0])
         elif time_ns[0] < self._last_ns:
-            # The clock went back, and the period is not to last the longer for it; but should it
-            # come again, the period is not over at once.
+            # After the clock went back the period must not become longer. If the clock then jumps
+            # forward again, the period does not end at once.
             self._later_ns, self._last_ns = self._last_ns, int(time_ns[0])
         over = len(time_ns)
         if self._later_ns is not None:
@@ -175,19 +175,19 @@ class Refits(Memory):
     def due(
         self, last_ns: int, closed: bool, by_time: bool, settings: Settings, segments: int
     ) -> bool:
-        """Tell whether the time or the segments since the last request ask for one.
+        """Return True if the time or the segments since the last request require a new one.
 
         Parameters
         ----------
         last_ns : int
             Time of the newest row.
         closed : bool
-            A segment closed at it.
+            A segment closed at that row.
         by_time : bool
-            The period ended at it.
+            The period ended at that row.
         settings : Settings
         segments : int
-            That a fit would have. Some must be new: half an hour more makes no other curve.
+            Number available to a fit. Some must be new: otherwise the curve would not change.
         """
         if by_time:
             self._last_ns = last_ns
@@ -200,8 +200,8 @@ class Refits(Memory):
         return (by_time and new > 0) or (closed and wanted > 0 and new >= wanted)
 
     def ask(self, last_ns: int) -> int:
-        """Note a request made now; return its name."""
-        # After the clock went back names must not come again.
+        """Record a request made now; return its name."""
+        # After the clock went back names must not repeat.
         self.pending_ns = max(last_ns, self._last_name_ns + 1)
         self._last_name_ns = self.pending_ns
         self._last_ns, self._later_ns = last_ns, None
@@ -209,18 +209,18 @@ class Refits(Memory):
         return self.pending_ns
 
     def settle(self, request_ns: int) -> bool:
-        """Take an outcome; tell whether it was awaited."""
+        """Accept an outcome; return True if it was expected."""
         if request_ns != self.pending_ns:
             return False
         self.pending_ns = None
         return True
 
     def ask_again(self, segments: int = 1) -> None:
-        """Wait no longer for the outcome that was asked for; so many segments count as new."""
+        """Cancel the pending request; count this many segments as new."""
         if self.pending_ns is not None:
             self.pending_ns = None
             self.count_as_new(segments)
 
     def count_as_new(self, segments: int = 1) -> None:
-        """Let so many of the segments seen last count as new."""
+        """Count this many of the last segments as new."""
         self._segments_at_request = min(self._segments_at_request, self.segments_seen - segments)

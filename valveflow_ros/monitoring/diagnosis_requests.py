@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""When the model is said not to fit, when a diagnosis is asked for, and what came of it.
+"""Decide when the model no longer fits and when to request a diagnosis, and keep the result.
 
-Decisions fall at the first row of each hour of the samples' own time, so that neither a clock nor
-the cutting of the stream has a part in them.
+Decisions are made at the first row of each hour in the time of the samples, so that they depend
+neither on a clock nor on how the stream is split into blocks.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ FITS_AGAIN = 'The model fits again.'
 LEAST_S = 86400.0
 _HOUR_NS = 3600 * NS_PER_S
 _DAY_NS = 24 * _HOUR_NS
-# The model is said to fit again below this share of the limit.
+# Below this fraction of the limit the model fits again.
 _RETURN = 0.7
 
 
 class Journal(Protocol):
-    """Writes a line of the journal at the boundary at hand."""
+    """Write a line of the journal at the current row."""
 
     def __call__(
         self, kind: JournalKind, request_ns: int, model_id: str, text: str
@@ -56,23 +56,23 @@ class Journal(Protocol):
 
 
 class DiagnosisRequests:
-    """Watches whether the model fits, asks for diagnoses, and keeps the last one.
+    """Check whether the model fits, request diagnoses, and keep the last one.
 
     Parameters
     ----------
     settings : Settings
     alarm : ResidualAlarm
-        While it is raised the power has left the curve.
+        While it is raised, the power differs from the curve.
     journal : Journal
 
     Attributes
     ----------
     misfit : Misfit
-        The statistic that spoke loudest at the last look.
+        The largest statistic at the last check.
     sentence : str
-        Why the model is said to fit no longer; empty while it fits.
+        Why the model no longer fits; empty while it fits.
     last : Diagnosed or None
-        What the last diagnosis gave.
+        The outcome of the last diagnosis.
     """
 
     def __init__(self, settings: Settings, alarm: ResidualAlarm, journal: Journal) -> None:
@@ -83,7 +83,7 @@ class DiagnosisRequests:
         self.sentence = ''
         self.last: Diagnosed | None = None
         self._onset_ns: int | None = None
-        # A curve makes its model anew each time it is asked, and rows come one by one.
+        # `curve.model` creates a new object at each access, and rows arrive one by one.
         self._model: tuple[Characteristic, RegionalModel] | None = None
         self._hour: int | None = None
         self._night: int | None = None
@@ -96,13 +96,13 @@ class DiagnosisRequests:
 
     @property
     def pending(self) -> bool:
-        """Tell whether a diagnosis was asked for and its outcome is awaited."""
+        """Return True if a diagnosis was requested and has no outcome yet."""
         return self._pending is not None
 
     def named_onset_ns(self, reference_ns: int) -> int | None:
-        """Return when a cause set in that the last diagnosis names; None if there is none.
+        """Return the onset of the cause named by the last diagnosis; None if there is none.
 
-        What was diagnosed before there was the reference is part of it.
+        Diagnoses from before the current reference are ignored: it includes their causes.
         """
         if self.last is None or self.last.task.window_end_ns <= reference_ns:
             return None
@@ -111,7 +111,7 @@ class DiagnosisRequests:
     def watch(
         self, block: PredictionBlock, temperature_degc: FloatArray, curve: Characteristic | None
     ) -> None:
-        """Take rows that the curve predicted."""
+        """Process rows that the curve predicted."""
         if curve is None:
             return
         if self._model is None or self._model[0] is not curve:
@@ -119,7 +119,7 @@ class DiagnosisRequests:
         self._mismatch.feed(block, temperature_degc, self._model[1])
 
     def rows_until_look(self, time_ns: IntArray) -> int:
-        """Return how many rows to take until the first one of another hour is among them."""
+        """Return how many rows to take up to and including the first one of another hour."""
         if self._hour is None:
             self._hour = int(time_ns[0]) // _HOUR_NS
             self._night = self._night_of(int(time_ns[0]))
@@ -129,16 +129,16 @@ class DiagnosisRequests:
     def look(
         self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int = 0
     ) -> list[Event]:
-        """Look at a boundary; where it is the first of an hour, judge and ask.
+        """At the first row of an hour, judge the model and request a diagnosis if needed.
 
         Parameters
         ----------
         time_ns : int
-            Of the newest row.
+            Time of the newest row.
         window : RollingWindow
         curve : Characteristic or None
         since_ns : int
-            Rows before are of no concern any more.
+            Earlier rows are not used.
         """
         hour = time_ns // _HOUR_NS
         if hour == self._hour:
@@ -160,7 +160,7 @@ class DiagnosisRequests:
     def request(
         self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int = 0
     ) -> list[Event]:
-        """Ask for a diagnosis now.
+        """Request a diagnosis now.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class DiagnosisRequests:
         return self._ask(ASKED, time_ns, window, curve, since_ns)
 
     def adopt(self, request_ns: int, content: str) -> list[Event]:
-        """Take a result; ``content`` is what `diagnosis.json` would hold."""
+        """Accept a result; ``content`` is the content of `diagnosis.json`."""
         task = self._settle(request_ns)
         if task is None:
             return []
@@ -183,7 +183,7 @@ class DiagnosisRequests:
         return [self.last, self._journal(kind, request_ns, model_id, mark)]
 
     def refuse(self, request_ns: int, reason: str) -> list[Event]:
-        """Note that a diagnosis gave no result."""
+        """Record that a diagnosis gave no result."""
         task = self._settle(request_ns)
         if task is None:
             return []
@@ -192,7 +192,7 @@ class DiagnosisRequests:
         return [self.last, self._journal(kind, request_ns, model_id, reason)]
 
     def snapshot(self) -> State:
-        """Return what is remembered. Of a task no rows are."""
+        """Return the state. Tasks are stored without their rows."""
         last, pending = self.last, self._pending
         return {
             'mismatch': self._mismatch.snapshot(),
@@ -210,7 +210,7 @@ class DiagnosisRequests:
         }
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         self._mismatch.restore(saved['mismatch'])
         self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
         last, pending = perhaps(saved, 'last', list), perhaps(saved, 'pending', dict)
@@ -230,25 +230,25 @@ class DiagnosisRequests:
         )  # fmt: skip
 
     def ask_again(self, reason: str) -> None:
-        """Wait no longer for the diagnosis that was asked for, and ask at the next look."""
+        """Cancel the pending diagnosis, and request another one at the next check."""
         if self._pending is not None:
             self._pending, self._asked_ns, self._wanted = None, None, reason
 
     def give_up(self, reason: str) -> list[Event]:
-        """Wait no longer for the diagnosis that was asked for."""
+        """Cancel the pending diagnosis."""
         return [] if self._pending is None else self.refuse(self._pending.request_ns, reason)
 
     def restart(self, reason: str) -> list[Event]:
-        """Forget the rows after the clock went back; names go on."""
+        """Forget all rows after the clock went back; names continue."""
         events = self.give_up(reason)
         self._mismatch = Mismatch(self.settings.real('sample_period'))
         self.misfit, self.sentence, self._wanted = NOTHING, '', ''
-        # Should the clock come again, it is no other night for that.
+        # If the clock jumps forward again, this does not count as another night.
         self._night_before, self._hour, self._night = self._night, None, None
         return events
 
     def _judge(self) -> list[Event]:
-        """Say that the model fits no longer, or does again; the alarm has said so itself."""
+        """Report that the model no longer fits, or fits again; the alarm reports itself."""
         if self._alarm.active and not self._raised:
             self._want(ALARM)
         self._raised = self._alarm.active
@@ -265,23 +265,23 @@ class DiagnosisRequests:
         return []
 
     def _want(self, reason: str) -> None:
-        """Have a diagnosis as soon as there can be one."""
+        """Schedule a diagnosis as soon as possible."""
         if self.settings.flag('diagnosis_on_mismatch'):
             self._wanted = reason
 
     def _night_of(self, time_ns: int) -> int:
-        """Return the number of the day, days beginning at the hour of the diagnosis."""
+        """Return the number of the day, where days begin at the hour of the diagnosis."""
         return (time_ns - self.settings.whole('diagnosis_hour') * _HOUR_NS) // _DAY_NS
 
     def _may_ask(self, time_ns: int) -> bool:
         pause_ns = round(self.settings.real('diagnosis_pause') * _HOUR_NS)
-        # The clock may have gone back behind the last one.
+        # The clock may have gone back to before the last request.
         return self._asked_ns is None or not 0 <= time_ns - self._asked_ns < pause_ns
 
     def _objection(
         self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int
     ) -> str:
-        """Return why there can be no diagnosis, empty if there can."""
+        """Return why a diagnosis is not possible; empty if it is."""
         if self.pending:
             return 'A diagnosis is running already.'
         if curve is None:
@@ -297,7 +297,7 @@ class DiagnosisRequests:
         since_ns: int,
     ) -> list[Event]:  # fmt: skip
         assert curve is not None
-        # After the clock went back names must not come again.
+        # After the clock went back names must not repeat.
         self._named_ns = max(time_ns, self._named_ns + 1)
         self._asked_ns, self._wanted = time_ns, ''
         task = DiagnosisTask(
@@ -308,7 +308,7 @@ class DiagnosisRequests:
         return [entry, DiagnosisRequested(task)]
 
     def _settle(self, request_ns: int) -> DiagnosisTask | None:
-        """Take an outcome; None if it was not awaited."""
+        """Accept an outcome and return its task; None if it was not expected."""
         task = self._pending
         if task is None or task.request_ns != request_ns:
             return None
@@ -317,7 +317,7 @@ class DiagnosisRequests:
 
 
 def _sentence(misfit: Misfit, limit: float) -> str:
-    """Say why the model is said to fit no longer."""
+    """Return a sentence on why the model no longer fits."""
     size = math.floor(10.0 * abs(misfit.score)) / 10.0
     return (
         f'The model no longer fits: {misfit.hint} (statistic: {misfit.name}, '
@@ -326,7 +326,7 @@ def _sentence(misfit: Misfit, limit: float) -> str:
 
 
 def _onset_ns(content: str) -> int | None:
-    """Return when the first of the named causes that set in at some moment did so."""
+    """Return the earliest onset of the named causes; None if none has an onset."""
     try:
         found = [
             e['origin_ns'] + round(e['value'] * _DAY_NS)
@@ -335,7 +335,7 @@ def _onset_ns(content: str) -> int | None:
             if e.get('origin_ns') is not None and e['value'] is not None
         ]
     except (ValueError, TypeError, KeyError, AttributeError):
-        return None  # of another version
+        return None  # content of another version
     return min(found, default=None)
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the engine says: events, each with the time of the row at which it happened."""
+"""The events of the engine, each with the time of its row."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SpecialSegment
 from valveflow_ros.segments.window import NO_ROWS, WindowContents
 
-# What a diagnosis is asked to do.
+# The input of a diagnosis.
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisTask:
-    """Everything a diagnosis depends on.
+    """All inputs of a diagnosis.
 
     Attributes
     ----------
     request_ns : int
-        Time of the row after which it was asked for; its name.
+        Time of the last row before the request; its name.
     contents : WindowContents
     settings : Settings
     curve : Characteristic
-        The curve in force, from which the diagnosis begins.
+        The current curve, used as the initial model.
     window_end_ns : int
         Time of the newest row in the window.
     """
@@ -42,20 +42,20 @@ class DiagnosisTask:
     window_end_ns: int
 
     def without_data(self) -> DiagnosisTask:
-        """Return a copy that keeps no rows, for whoever only wants to know what was asked."""
+        """Return a copy without rows, to identify the request."""
         return replace(self, contents=NO_ROWS)
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisContent:
-    """What a diagnosis gave: the window's newest row, and what `diagnosis.json` would hold."""
+    """The result of a diagnosis: newest row of the window, and the content of `diagnosis.json`."""
 
     window_end_ns: int
     text: str
 
 
 class JournalKind(enum.IntEnum):
-    """Why the engine's state changed other than by a row; numbers as in the message."""
+    """Reasons for changes of the engine state other than rows; numbers as in the message."""
 
     FIT_REQUESTED = 1
     FIT_ADOPTED = 2
@@ -75,7 +75,7 @@ class JournalKind(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """One decision, at the boundary after ``rows`` rows; a replay repeats it there."""
+    """One decision after ``rows`` rows; a replay repeats it at the same place."""
 
     time_ns: int
     kind: JournalKind
@@ -94,17 +94,17 @@ class SegmentClosed:
 
 @dataclass(frozen=True, slots=True)
 class FitRequested:
-    """A fit is wanted; somebody has to compute ``task`` and hand the outcome back."""
+    """A fit is requested; the caller computes ``task`` and returns the outcome."""
 
     task: FitTask
 
 
 @dataclass(frozen=True, slots=True)
 class CurveAdopted:
-    """A fit gave a new curve. It predicts from the next row on if there is no reference.
+    """A fit gave a new curve. If there is no reference, it predicts from the next row on.
 
-    ``shift`` is the judgement against the reference, None without one; ``provisional`` says what
-    it is no curve of health for, empty if nothing is wrong.
+    ``shift`` is the judgement against the reference, None without one. ``provisional`` says why
+    the curve does not show the healthy plant; empty if there is no fault.
     """
 
     characteristic: Characteristic
@@ -121,7 +121,7 @@ class ReferenceSet:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisRequested:
-    """A diagnosis is wanted; somebody has to compute ``task`` and hand the outcome back."""
+    """A diagnosis is requested; the caller computes ``task`` and returns the outcome."""
 
     task: DiagnosisTask
 
@@ -133,11 +133,11 @@ class Diagnosed:
     Attributes
     ----------
     task : DiagnosisTask
-        What was diagnosed.
+        The input of the diagnosis.
     content : str
-        What `diagnosis.json` would hold; empty if there is no result.
+        Content of `diagnosis.json`; empty if there is no result.
     reason : str
-        Why there is none.
+        Why there is no result.
     """
 
     task: DiagnosisTask

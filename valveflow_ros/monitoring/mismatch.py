@@ -1,15 +1,15 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Watch, at little cost, whether the model still fits.
+"""Check with little computation whether the model still fits.
 
-The residual's chart sees that the power is off. What is off only at one load, in one direction,
-at one time of day or after moves leaves the mean of the residual alone; so here each minute's
-residual is set against what such a fault would make it proportional to: a scalar least squares
-that forgets within three days, one for each statistic. How far an estimate may be from zero by
-chance is taken from the scores of blocks of two hours and of neighbouring blocks (White; Newey and
-West, Econometrica 55, 1987), so that neither the residual's correlation nor a noise that depends
-on the load has to be known. It says that the model does not fit and at best hints at why: naming
-the cause takes the whole record (`valveflow_ros.diagnosis`).
+The control chart of the residual detects an error of the mean power. A fault at one load, in one
+direction, at one time of day or after moves may not change the mean residual. So the residual of
+each minute is regressed on the expected pattern of such faults: one scalar recursive least squares
+estimate per statistic, with a memory of three days. The standard errors come from the scores of
+blocks of two hours and of neighbouring blocks (White; Newey and West, Econometrica 55, 1987), so
+that neither the correlation of the residual nor the load dependence of its noise must be known.
+The result is that the model does not fit, with a hint at most; finding the cause needs the whole
+record (`valveflow_ros.diagnosis`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 from valveflow_ros.state import Memory
 
-# One pass over rows: means of a minute, what they say, and sums that forget.
+# One pass over rows: means of a minute, their regressors, and sums with exponential forgetting.
 
 MINUTE_NS = 60 * NS_PER_S
 BLOCK_NS = 7200 * NS_PER_S
@@ -34,23 +34,23 @@ MEMORY_BLOCKS = 36.0  # three days
 _MEMORY_MINUTES = 4320.0
 BINS = 12
 OFFSET, GAIN, INPUT, TEMPERATURE, COSINE, SINE, DIRECTION, LAG_LOW, LAG_HIGH = range(9)
-MOVE = 9  # answers to the move of this minute, of the one before and of the one before that
+MOVE = 9  # responses to the moves of this minute and of the two minutes before
 MOVES = 3
 BIN = MOVE + MOVES
 FEATURES = BIN + BINS
-# Half the band in which a change of u is no move, as a share of u.
+# Half width of the play operator for the direction of u, as a fraction of u.
 _PLAY = 0.005
 
-# What a block adds up for each statistic (block), and the sums over blocks that forget (kept).
+# Sums over a block for each statistic (block), and sums over blocks with forgetting (kept).
 S, Q, N = range(3)
 (SUM_S, SUM_Q, SUM_N, SUM_SS, SUM_SQ, SUM_QQ, NEXT_SS, NEXT_SQ, NEXT_QS, NEXT_QQ, LAST_S,
  LAST_Q) = range(12)  # fmt: skip
 KEPT = 12
-# Of the minute at hand.
+# Sums over the current minute.
 _R, _X, _D, _U, _T, _GOOD, _WARM = range(7)
 MINUTE = 7
-# Numbers that live on: squares of the residual and their count, both forgetting; the mean
-# temperature and its weight; the middle of the play; the flows of the last minutes.
+# State: sum of squared residuals and their count, both with forgetting; the mean temperature
+# and its weight; the middle of the play; the flows of the last minutes.
 POWER, COUNT, MEAN_T, WEIGHT_T, PLAY, PAST = range(6)
 STATE = PAST + MOVES + 1
 AT_MINUTE, AT_BLOCK, BLOCKS = range(3)
@@ -63,7 +63,7 @@ def _forget_past(state: FloatArray) -> None:
 
 @jit
 def _play(state: FloatArray, u: float) -> float:
-    """Move the play along; return where in it u stands, -1 falling to 1 rising."""
+    """Update the play operator; return the position of u in it, -1 falling to 1 rising."""
     half = _PLAY * abs(u)
     if half == 0.0:
         return 0.0
@@ -77,7 +77,7 @@ def _play(state: FloatArray, u: float) -> float:
 
 @jit
 def _warm(state: FloatArray, minute: FloatArray) -> float:
-    """Return the mean temperature less its mean so far, which this minute then joins."""
+    """Return the temperature minus its mean so far, then update that mean."""
     if minute[_WARM] == 0.0:
         return 0.0
     t = minute[_T] / minute[_WARM]
@@ -92,7 +92,7 @@ def _features(
     middle_ns: int, minute: FloatArray, state: FloatArray, knots: FloatArray, left: FloatArray,
     right: FloatArray, z: FloatArray,
 ) -> None:  # fmt: skip
-    """Write what the residual of a minute would be in proportion to, statistic by statistic."""
+    """Write the regressor of each statistic for the residual of a minute."""
     good = minute[_GOOD]
     x, answer, u = minute[_X] / good, minute[_D] / good, minute[_U] / good
     low, high = knots[0], knots[-1]
@@ -130,7 +130,7 @@ def _end_minute(
     middle_ns: int, minute: FloatArray, state: FloatArray, knots: FloatArray, left: FloatArray,
     right: FloatArray, block: FloatArray, z: FloatArray,
 ) -> None:  # fmt: skip
-    """Add a whole minute to the block."""
+    """Add a complete minute to the block."""
     _features(middle_ns, minute, state, knots, left, right, z)
     r = minute[_R] / minute[_GOOD]
     state[POWER] += r * r
@@ -144,7 +144,7 @@ def _end_minute(
 
 @jit
 def _end_block(follows: int, block: FloatArray, kept: FloatArray, state: FloatArray) -> None:
-    """Add a block to the sums that forget; ``follows`` is how many blocks on the next one is."""
+    """Add a block to the sums; ``follows`` is the number of blocks until the next one."""
     forget = math.exp(-follows / MEMORY_BLOCKS)
     twice = forget * forget
     state[POWER] *= forget
@@ -187,18 +187,18 @@ def run(
     kept: FloatArray,
     z: FloatArray,
 ) -> None:
-    """Run rows; a minute and a block are judged by the first row behind them.
+    """Process rows; a minute or block ends with the first row after it.
 
     Parameters
     ----------
     minute_ns : int
-        Length of a minute; longer than one where rows are rarer.
+        Length of a minute; longer if the step of the rows is longer.
     least : int
-        Rows without which a minute does not count.
+        Number of rows that a minute needs to count.
     place : int64 (3,)
-        Number of the minute and of the block at hand, -1 before the first, and blocks ended.
+        Number of the current minute and block, -1 before the first, and count of ended blocks.
     minute (MINUTE,), state (STATE,), block (FEATURES, 3), kept (FEATURES, KEPT), z (FEATURES,)
-        The memory, and room.
+        The state, and work arrays.
     """
     for t in range(u.size):
         now = time_ns[t] // minute_ns
@@ -227,9 +227,9 @@ def run(
                 minute[_WARM] += 1.0
 
 
-# What is below this share of the residual's sd is not worth a word, however sure it is.
+# Effects below this fraction of the residual's sd are not reported, even if significant.
 FLOOR = 0.05
-# Blocks of two hours that must speak of a statistic before it is judged.
+# Effective number of two-hour blocks needed to judge a statistic.
 LEAST_BLOCKS = 10.0
 NAMES = (
     'offset', 'gain', 'input', 'temperature', 'time of day (cosine)', 'time of day (sine)',
@@ -241,16 +241,16 @@ NAMES = (
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """The statistic that speaks loudest.
+    """The largest statistic.
 
     Attributes
     ----------
     score : float
-        As a normal deviate, signed; 0 where nothing can be judged.
+        Signed, as a standard normal deviate; 0 if nothing can be judged.
     name : str
-        One of `NAMES`; empty where nothing can be judged.
+        One of `NAMES`; empty if nothing can be judged.
     hint : str
-        What the residual depends on, as the end of a sentence.
+        Variable on which the residual depends, as the end of a sentence.
     """
 
     score: float
@@ -262,7 +262,7 @@ NOTHING = Misfit(0.0, '', '')
 
 
 class Mismatch(Memory):
-    """Recursive statistics of the residual, in constant memory and time a row.
+    """Recursive statistics of the residual, with constant memory and time per row.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ class Mismatch(Memory):
     def feed(
         self, block: PredictionBlock, temperature_degc: FloatArray, model: RegionalModel
     ) -> None:
-        """Take rows that ``model`` has predicted; a new model goes on where the last one stopped.
+        """Process rows that ``model`` has predicted; the statistics continue with a new model.
 
         Parameters
         ----------
@@ -305,16 +305,16 @@ class Mismatch(Memory):
         """Return the statistics as normal deviates, shape (len(NAMES),); 0 where not judged."""
         with np.errstate(over='ignore', invalid='ignore'):
             theta, spread, blocks = self._estimates()
-        # Numbers so large that their squares are none say nothing either.
+        # Values whose squares overflow are not judged.
         judged = (blocks >= LEAST_BLOCKS) & (spread > 0.0) & np.isfinite(theta + spread)
         t = np.divide(theta, spread, out=np.zeros_like(theta), where=judged)
-        # Student's t with few blocks as the normal deviate of the same chance (Wallace, 1959).
+        # Student's t as the normal deviate of equal probability (Wallace, 1959).
         n = np.maximum(blocks - 1.0, 1.0)
         factor = (8.0 * n + 1.0) / (8.0 * n + 3.0)
         return np.asarray(np.sign(t) * factor * np.sqrt(n * np.log1p(t * t / n)))
 
     def judge(self) -> Misfit:
-        """Return the statistic that speaks loudest."""
+        """Return the largest statistic."""
         scores = self.scores()
         j = int(np.argmax(np.abs(scores)))
         if scores[j] == 0.0:
@@ -323,13 +323,13 @@ class Mismatch(Memory):
         return Misfit(float(scores[j]), NAMES[j], self._hint(j, float(effect)))
 
     def _size(self) -> FloatArray:
-        """Return the root mean square of what each statistic is in proportion to."""
+        """Return the root mean square of each regressor."""
         kept = self._kept
         count = np.maximum(kept[:, SUM_N], 1.0)
         return np.asarray(np.sqrt(kept[:, SUM_Q] / count))
 
     def _estimates(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return estimates, their standard errors, and how many blocks they rest on."""
+        """Return estimates, their standard errors, and their effective numbers of blocks."""
         kept = self._kept
         q, qq = kept[:, SUM_Q], kept[:, SUM_QQ]
         there = (q > 0.0) & (qq > 0.0)
@@ -348,7 +348,7 @@ class Mismatch(Memory):
         return theta, spread, np.where(there, q**2 / np.where(there, qq, 1.0), 0.0)
 
     def _hint(self, j: int, effect: float) -> str:
-        """Say what a statistic means; ``effect`` in MW."""
+        """Return the meaning of a statistic in words; ``effect`` in MW."""
         size, side = f'{abs(effect):.2g} MW', 'more' if effect > 0.0 else 'less'
         if j >= BIN:
             low, high = self._ends

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The engine: rows in, events out. No clock, no files, no threads, no ROS."""
+"""The engine: it turns rows into events, without a clock, files, threads or ROS."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ IN_TIME = 'it is from before something went wrong'
 WORN = 'the curve is further from the first reference than wear_budget allows'
 OF_ITSELF = (BY_ITSELF, IN_TIME, WORN)
 _OF_CHART = {'alarm_run_length', 'alarm_block', 'alarm_floor'}
-# Parts of a state in words.
+# Names of the parts of a state in messages.
 _PARTS = {
     'force': 'the curve', 'reference': 'the reference', 'diagnosing': 'the last diagnosis',
     'alarm': 'the residual alarm', 'part of reference': 'the alarm on its shift',
@@ -57,15 +57,15 @@ class Monitor(Memory):
     ----------
     settings : Settings
     corrector : Corrector, optional
-        Takes known causes out of the rows before anything looks at them.
+        Removes known causes from the rows before they are used.
 
     Notes
     -----
-    The state changes by rows and by the calls `adopt`, `refuse`, `operate_alarms`, `request_fit`,
-    `set_reference`, `request_diagnosis`, `restart`, `resume` and `reconfigure`, and those of
-    `diagnosing`, nothing else, and each such call leaves a `JournalEntry` with the number of rows
-    before it. Rows and journal together give the same events again, bit for bit. `carry` begins
-    with a state that they do not lead to: a recording from there on cannot be replayed alone.
+    The state changes only by rows and by the calls `adopt`, `refuse`, `operate_alarms`,
+    `request_fit`, `set_reference`, `request_diagnosis`, `restart`, `resume` and `reconfigure`, and
+    those of `diagnosing`. Each such call adds a `JournalEntry` with the number of rows before it.
+    Rows and journal reproduce the same events, bit for bit. `carry` starts from a state of another
+    run: a recording from there on cannot be replayed alone.
     """
 
     REMEMBERED = (
@@ -84,8 +84,8 @@ class Monitor(Memory):
         self._rows = 0
         self._last_ns = 0
         self._went_back = False
-        self._chart_due = False  # the parameters of the residual's chart have changed
-        self._chart_not_ns: int | None = None  # a request from before that
+        self._chart_due = False  # the chart parameters have changed
+        self._chart_not_ns: int | None = None  # a request from before that change
         self.judged = Judged(0, math.nan, math.nan)
         self._refits = Refits()
         self.reference = ReferenceCurve(settings)
@@ -109,22 +109,22 @@ class Monitor(Memory):
 
     @property
     def predicting(self) -> Characteristic | None:
-        """Return the curve that predicts: the reference, before there is one the running one."""
+        """Return the curve used for predictions: the reference, or the running one without it."""
         return self._force.predicting
 
     @property
     def status(self) -> CurveStatus:
-        """Return what the running curve is worth."""
+        """Return the status of the running curve."""
         return self._force.status
 
     @property
     def cause(self) -> str:
-        """Return why there is no curve, or only a stale one; empty if it is fresh."""
+        """Return why there is no curve, or only a stale one; empty if it is up to date."""
         return self._force.cause
 
     @property
     def fit_pending(self) -> bool:
-        """Tell whether a fit was asked for and its outcome is awaited."""
+        """Return True if a fit was requested and has no outcome yet."""
         return self._refits.pending_ns is not None
 
     @property
@@ -134,7 +134,7 @@ class Monitor(Memory):
 
     @property
     def special_samples(self) -> int:
-        """Return the number of samples in those segments."""
+        """Return the number of samples in the special segments."""
         return self._window.special_samples
 
     def special_segments(self) -> tuple[SpecialSegment, ...]:
@@ -146,16 +146,16 @@ class Monitor(Memory):
         return self._window.numbers()
 
     def noise(self) -> NoiseLevel:
-        """Return the noise levels the thresholds stand on."""
+        """Return the noise levels used for the thresholds."""
         return self._segmenter.noise()
 
     def reconfigure(self, settings: Settings) -> list[Event]:
-        """Take settings of which only live ones differ.
+        """Apply settings in which only live parameters differ.
 
         Raises
         ------
         ParameterError
-            One differs that may not be changed while the monitor runs.
+            A parameter differs that cannot be changed while the monitor runs.
         """
         changed = self.settings.live_changes(settings)
         if not changed:
@@ -164,8 +164,8 @@ class Monitor(Memory):
         self._alarms.configure(settings)
         self._force.configure(settings)
         if changed.keys() & _OF_CHART:
-            # The next fit brings another chart, and is not to wait for new segments; one that
-            # runs already has the old parameters.
+            # The next fit gives a new chart, and must not wait for new segments. A fit that is
+            # already running has the old parameters.
             self._chart_due = True
             self._chart_not_ns = self._refits.pending_ns
             self._refits.count_as_new(self.segments)
@@ -173,7 +173,7 @@ class Monitor(Memory):
         return [self._journal(JournalKind.SETTINGS, 0, '', text)]
 
     def feed(self, table: SampleTable) -> Fed:
-        """Take rows until they end, or a fit or a diagnosis is wanted."""
+        """Take rows until their end, or until a fit or a diagnosis is requested."""
         events: list[Event] = []
         rows = Rows.of(table, self.settings.real('pressure_exponent'), self._correction)
         done = 0
@@ -182,7 +182,7 @@ class Monitor(Memory):
             most = min(until, self.diagnosing.rows_until_look(table.time_ns[done:]))
             taken, closed = self._take(rows.part(done, done + most), events)
             done += taken
-            # Decisions never fall where a block happens to end: cutting must not matter.
+            # Decisions do not depend on the ends of blocks.
             looked = self.diagnosing.look(
                 self._last_ns, self._window, self.predicting, self._diagnosed_since()
             )
@@ -194,9 +194,9 @@ class Monitor(Memory):
         return Fed(done, events)
 
     def adopt(self, request_ns: int, characteristic: Characteristic) -> list[Event]:
-        """Hold the curve of a fit; before there is a reference it predicts from the next row on.
+        """Adopt the curve of a fit; without a reference it predicts from the next row on.
 
-        An outcome of a request that is no longer awaited is ignored.
+        The outcome of a request that is not pending is ignored.
         """
         if request_ns != self._refits.pending_ns:
             return []
@@ -227,7 +227,7 @@ class Monitor(Memory):
         return events
 
     def refuse(self, request_ns: int, reason: str) -> list[Event]:
-        """Note that a fit gave no curve; the old one stays, as stale."""
+        """Record that a fit gave no curve; the old one stays, as stale."""
         if not self._refits.settle(request_ns):
             return []
         begun = self._follow_health()
@@ -237,12 +237,12 @@ class Monitor(Memory):
         return [*begun, self._journal(JournalKind.FIT_REFUSED, request_ns, '', reason)]
 
     def request_fit(self) -> list[Event]:
-        """Ask for a fit now.
+        """Request a fit now.
 
         Raises
         ------
         DataError
-            One is running already, or there is nothing to fit.
+            A fit is already running, or there is nothing to fit.
         """
         if self.fit_pending:
             raise DataError('A fit is running already.')
@@ -251,18 +251,18 @@ class Monitor(Memory):
         return self._ask(BY_HAND)
 
     def request_diagnosis(self) -> list[Event]:
-        """Ask for a diagnosis now; raises `DataError` where that makes no sense."""
+        """Request a diagnosis now; raises `DataError` if that is not possible."""
         return self.diagnosing.request(
             self._last_ns, self._window, self.predicting, self._diagnosed_since()
         )
 
     def operate_alarms(self, action: AlarmAction, name: str | None = None) -> list[Event]:
-        """Acknowledge, shelve or unshelve the alarms, or the one of a name.
+        """Acknowledge, shelve or unshelve all alarms, or the one of a name.
 
         Raises
         ------
         DataError
-            There is no alarm of that name, or none to which that can be done.
+            There is no alarm of that name, or the action applies to none of them.
         """
         model_id = self._model_id()
         changes = self._alarms.operate(action, self.judged, model_id, name)
@@ -270,16 +270,16 @@ class Monitor(Memory):
         return [*changes, entry, *self._follow_health()]
 
     def set_reference(self, given: Characteristic | None = None) -> list[Event]:
-        """Let the running curve, or one that is given, be the plant in health.
+        """Declare the running curve, or a given one, to be the curve of the healthy plant.
 
-        Predictions come from it, and later curves are judged against it. Whatever was wrong is
-        accepted by that. One that is given stands in the journal whole, since no data of this
-        run lead to it.
+        It is used for predictions and to judge later curves. Existing faults are thereby accepted.
+        A given curve is written to the journal completely, because it cannot be computed from the
+        data of this run.
 
         Raises
         ------
         DataError
-            There is no curve, or one of another input u.
+            There is no curve, or its input u is another one.
         """
         curve = self.characteristic if given is None else given
         if curve is None:
@@ -292,14 +292,14 @@ class Monitor(Memory):
         return [ReferenceSet(curve), entry, *changes]
 
     def restart(self, reason: str) -> list[Event]:
-        """Begin anew after the clock went back; curve, alarm and the rows before it stay.
+        """Restart after the clock went back; curve, alarm and earlier rows stay.
 
-        The rows that the clock had passed are set aside with the next row, whose time tells which
-        those are; see `RollingWindow`.
+        Rows with times after that of the next row are removed when it arrives;
+        see `RollingWindow`.
         """
         pending = self._refits.pending_ns
         events: list[Event] = [] if pending is None else self.refuse(pending, reason)
-        # What the curve stands on may have changed, and a fit that was running is lost.
+        # The basis of the curve may have changed, and a running fit is lost.
         self._refits.count_as_new()
         self._correction.restart()
         self._went_back = True
@@ -308,28 +308,28 @@ class Monitor(Memory):
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
     def carry(self, saved: State, then: Settings) -> tuple[str, list[Event]]:
-        """Go on from a state of other settings or another version, with all of it that is of use.
+        """Continue from a state of other settings or another version, as far as possible.
 
-        Call it before the first row. A few rows may be missing before that, and its time may be
-        any.
+        Call it before the first row. A few rows may be missing in between, and the time may have
+        jumped.
 
         Parameters
         ----------
         saved : State
-            What `snapshot` gave.
+            Result of `snapshot`.
         then : Settings
-            With which it was made.
+            The settings of that state.
 
         Returns
         -------
         tuple of str and list of Event
-            What changed, what was found anew and what was let go, in sentences; and the line of
-            the journal with the parameters that changed.
+            Sentences on what changed, was computed again or was discarded; and the journal entry
+            with the parameters that changed.
 
         Raises
         ------
         DataError
-            No part of it can be used.
+            No part of the state can be used.
         """
         changed = self.settings.changes(then)
         depends = max((parameter(n).depends for n in changed), default=Depends.NOTHING)
@@ -361,20 +361,20 @@ class Monitor(Memory):
         return self._carried(self.settings.retuned(then), lost), [*entry]
 
     def resume(self, reason: str) -> list[Event]:
-        """Ask again in its time for what was being computed when the monitor ended."""
+        """Request again the fit and the diagnosis that were running when the monitor ended."""
         self._refits.ask_again(self.segments)
         self.diagnosing.ask_again(reason)
         return [self._journal(JournalKind.RESUMED, 0, self._model_id(), reason)]
 
     def check_clock(self) -> None:
-        """Raise `DataError` between a step back of the clock and the row that tells how far."""
+        """Raise `DataError` between a step back of the clock and the next row."""
         if self._went_back:
             raise DataError('The clock has just gone back; try again after the next sample.')
 
     def _take(self, rows: Rows, events: list[Event]) -> tuple[int, bool]:
-        """Run rows up to the next segment's close through everything.
+        """Process rows up to the end of the next segment.
 
-        Returns the rows taken and whether a segment closed at the last of them.
+        Returns the number of rows taken and whether a segment closed at the last one.
         """
         segmented = self._segmenter.feed(
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, most=1
@@ -397,7 +397,7 @@ class Monitor(Memory):
         return n, bool(segmented.found)
 
     def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
-        """Append what the rows brought; a segment can only have closed at the last of them."""
+        """Append the events of the rows; a segment can only close at the last row."""
         events.append(block)
         if self.predicting is not None:
             events += self._alarms.feed(block)
@@ -410,7 +410,7 @@ class Monitor(Memory):
             events.append(SegmentClosed(found.segment))
 
     def _due(self, closed: bool, by_time: bool) -> bool:
-        """Tell whether a fit is to be asked for at this boundary."""
+        """Return True if a fit must be requested at this row."""
         if not (closed or by_time):
             return False
         segments = self._window.special_segments(self.reference.regime_ns)
@@ -432,7 +432,7 @@ class Monitor(Memory):
         return [*before, entry, FitRequested(task)]
 
     def _follow_health(self) -> list[Event]:
-        """Follow whether something is wrong, at boundaries that a replay has too."""
+        """Update whether there is a fault, at rows where a replay does the same."""
         named_ns = self.diagnosing.named_onset_ns(self.reference.set_ns)
         own_ns = self.alarm.onset_ns if self.alarm.active else None
         onsets = [ns for ns in (named_ns, own_ns) if ns is not None]
@@ -444,7 +444,7 @@ class Monitor(Memory):
         return []
 
     def _renew(self, curve: Characteristic, reason: str) -> list[Event]:
-        """Let a curve be the reference by itself."""
+        """Make a curve the reference automatically."""
         segments = self._window.special_segments(self.reference.regime_ns)
         self.reference.renew(curve, segments, self._last_ns)
         self._predict()
@@ -452,7 +452,7 @@ class Monitor(Memory):
         return [ReferenceSet(curve), entry]
 
     def _predict(self, *, afresh: bool = False) -> None:
-        """Predict from the reference, or from the running curve where that cannot be judged."""
+        """Predict from the reference, or from the running curve if the reference has no chart."""
         reference = self.reference.curve
         limit = self.settings.real('alarm_limit') > 0.0
         judges = reference is not None and (limit or reference.residuals.chart is not None)
@@ -461,10 +461,10 @@ class Monitor(Memory):
             self._force.predict_from(curve, self._window, afresh=afresh)
 
     def _take_chart(self, curve: Characteristic) -> None:
-        """Let the reference have the chart of a curve, where other parameters ask for another.
+        """Give the reference the control chart of a new curve, if the chart parameters changed.
 
-        It says what the residual of the healthy plant is like, so a provisional curve has none
-        to give.
+        The chart describes the residual of the healthy plant, so the chart of a provisional curve
+        is not used.
         """
         chart = curve.residuals.chart
         if self._chart_due and chart is not None and self.reference.fault_ns is None:
@@ -474,7 +474,7 @@ class Monitor(Memory):
                 self._predict()
 
     def _usable(self, saved: State, lost: set[str]) -> State:
-        """Return the parts of a state that fit; the others are empty, and added to ``lost``."""
+        """Return the valid parts of a state; the others are empty, and are added to ``lost``."""
         corrector = self._correction.corrector
         empty = Monitor(self.settings, corrector).snapshot()
         pieces = {
@@ -500,7 +500,7 @@ class Monitor(Memory):
         return parts
 
     def _asks_for_another_form(self, curve: Characteristic | None) -> bool:
-        """Tell whether the settings ask for another form of the curve than a given one has."""
+        """Return True if the settings require another form of the curve than the given one has."""
         axis, exponent = self.settings.text('axis'), self.settings.real('pressure_exponent')
         if curve is None or axis == 'auto':
             return False
@@ -509,7 +509,7 @@ class Monitor(Memory):
         return curve.axis != axis
 
     def _carried(self, names: Sequence[str], lost: set[str]) -> str:
-        """Say what changed since a state was saved, and what of it was let go."""
+        """Return sentences on what changed since a state was saved, and what was discarded."""
         told = f'Since the state was saved {listed(names)} changed.' if names else ''
         if 'window' in lost:
             told += ' The window of rows is empty and fills again.'
@@ -532,7 +532,7 @@ class Monitor(Memory):
         )
 
     def _provisional(self) -> str:
-        """Say what the running curve is made from while something is wrong."""
+        """Return which data the running curve is made from during a fault; empty without one."""
         since_ns = self.reference.fault_ns
         if since_ns is None:
             return ''
@@ -547,11 +547,11 @@ class Monitor(Memory):
         )
 
     def _diagnosed_since(self) -> int:
-        """Return from when on rows are diagnosed: what is wrong shows against what was right."""
+        """Return the first time for a diagnosis: with a fault, also the rows before its onset."""
         return self.reference.regime_ns if self.reference.fault_ns is None else 0
 
     def _known_form(self) -> StaticForm | None:
-        """Return the form that the running curve was told to have, or was given as known."""
+        """Return the form of the running curve if it was given in the settings or is scaled."""
         curve = self.characteristic
         if curve is None or curve.form is None:
             return None
@@ -561,8 +561,8 @@ class Monitor(Memory):
         return '' if self.characteristic is None else self.characteristic.model_id
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
-        # Earlier versions know neither these nor weather, for which their charts have no room.
+        """Continue from a saved state; raises `DataError` if it does not fit."""
+        # Earlier versions have neither these values nor a wander in their charts.
         super().restore({'chart_due': False, 'chart_not_ns': None, **saved})
         curve = self.reference.curve
         if curve is not None and math.isnan(curve.residuals.wander_mw):
@@ -575,7 +575,7 @@ class Monitor(Memory):
 
 
 def _fits(fresh: Monitor, saved: State) -> bool:
-    """Tell whether a state fits a monitor, which is not to be used afterwards."""
+    """Return True if a state fits a monitor, which must not be used afterwards."""
     try:
         fresh.restore(saved)
     except (DataError, LookupError, TypeError, ValueError, AttributeError):
@@ -584,7 +584,7 @@ def _fits(fresh: Monitor, saved: State) -> bool:
 
 
 def _found_before(saved: State) -> int:
-    """Return how many segments a state of any version has numbered."""
+    """Return the number of segments found before a state of any version."""
     segmenter = saved.get('segmenter')
     number = segmenter.get('number') if isinstance(segmenter, dict) else 0
     return number if type(number) is int else 0

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Drive the engine without a plant: fits in place, or where a journal says."""
+"""Run the engine without a plant: compute fits at once, or repeat those of a journal."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _quiet(_share: float, _what: str) -> None:
 
 
 def outcome_of(monitor: Monitor, task: FitTask) -> list[Event]:
-    """Compute a fit here and now, and hand it to the engine."""
+    """Compute a fit now, and pass the outcome to the engine."""
     try:
         return monitor.adopt(task.request_ns, fit(task))
     except DataError as error:
@@ -44,7 +44,7 @@ def outcome_of(monitor: Monitor, task: FitTask) -> list[Event]:
 
 
 def align_all(aligner: Aligner, readings: Readings) -> Iterator[Aligned]:
-    """Yield all rows of a finished list of readings."""
+    """Yield all rows of a complete list of readings."""
     yield aligner.feed(readings)
     yield aligner.finish()
 
@@ -52,9 +52,9 @@ def align_all(aligner: Aligner, readings: Readings) -> Iterator[Aligned]:
 def feed_rows(
     monitor: Monitor, table: SampleTable, diagnose: Callable[[DiagnosisTask], str] | None = None
 ) -> list[Event]:
-    """Feed rows, computing every fit in place; with ``diagnose`` every diagnosis too.
+    """Feed rows and compute every fit at once; with ``diagnose`` also every diagnosis.
 
-    It returns what `diagnosis.json` would hold, or raises `DataError`.
+    ``diagnose`` returns the content of `diagnosis.json`, or raises `DataError`.
     """
     events: list[Event] = []
     done = 0
@@ -77,7 +77,7 @@ def feed_rows(
 def feed_aligned(
     monitor: Monitor, aligned: Aligned, diagnose: Callable[[DiagnosisTask], str] | None = None
 ) -> list[Event]:
-    """Feed rows with restarts of the clock among them, as `feed_rows` does."""
+    """Feed rows that contain restarts of the clock, like `feed_rows`."""
     events: list[Event] = []
     start = 0
     for reset in aligned.resets.tolist():
@@ -88,24 +88,24 @@ def feed_aligned(
 
 
 class JournalReplayer:
-    """Feed rows and repeat a live run's decisions at the boundaries its journal names.
+    """Feed rows and repeat the decisions of a live run at the rows given in its journal.
 
     Parameters
     ----------
     monitor : Monitor
-        Fresh, with the settings of the live run.
+        A new one, with the settings of the live run.
     journal : sequence of JournalEntry
-        In the order written. What the engine says and asks for by itself comes anew
-        and is not repeated; everything else is.
+        In the order written. Decisions that the engine makes from the rows alone are computed
+        again; all others are repeated.
     diagnose : callable, optional
-        Computes a diagnosis and returns its content; without it none that the journal holds can
-        be repeated.
+        Computes a diagnosis and returns its content; without it the diagnoses of the journal
+        cannot be repeated.
     curves : callable, optional
-        Returns the curve of a name, where there is a quicker way than to compute it again.
+        Returns the curve of a given name, if that is faster than computing it again.
     compute : callable
-        Computes a fit where there is none.
+        Computes a fit if ``curves`` is not given.
     left : list of str, optional
-        Takes why an entry cannot be repeated; without it the first such entry is an error.
+        Receives the reasons why entries cannot be repeated; without it such an entry is an error.
     """
 
     def __init__(
@@ -143,9 +143,9 @@ class JournalReplayer:
             self._keep(fed.events)
 
     def feed_aligned(self, aligned: Aligned) -> list[Event]:
-        """Feed rows with restarts of the clock among them; return the events.
+        """Feed rows that contain restarts of the clock; return the events.
 
-        A run that was killed may have left no line of the journal about the last one.
+        If a run was killed, its journal may lack the last restart.
         """
         events: list[Event] = []
         start = 0
@@ -179,7 +179,7 @@ class JournalReplayer:
 
     @property
     def due(self) -> int:
-        """Return how many entries of the journal wait for rows that did not come yet."""
+        """Return how many journal entries belong to rows that have not arrived yet."""
         return len(self._due)
 
     def _repeat(self, entry: JournalEntry) -> list[Event]:
@@ -216,7 +216,7 @@ class JournalReplayer:
         return []
 
     def _adopt(self, entry: JournalEntry) -> list[Event]:
-        """Compute the fit that was adopted; it must be the one that was."""
+        """Compute the fit that was adopted; its curve must have the same name."""
         if self._curves is not None:
             return self._monitor.adopt(entry.request_ns, self._curves(entry.model_id))
         task = self._tasks.pop(entry.request_ns, None)
@@ -234,7 +234,7 @@ class JournalReplayer:
         return self._monitor.adopt(entry.request_ns, found)
 
     def _conclude(self, entry: JournalEntry) -> list[Event]:
-        """Compute the diagnosis that was published; the journal's line tells if it is the same."""
+        """Compute the published diagnosis; the journal entry shows whether it is the same."""
         task, self._diagnosis = self._diagnosis, None
         if task is None or task.request_ns != entry.request_ns:
             raise DataError('The journal has a diagnosis that was never asked for.')
@@ -244,7 +244,7 @@ class JournalReplayer:
 
 
 def _from_outside(entry: JournalEntry) -> bool:
-    """Tell whether the engine would not come to this by itself."""
+    """Return True if the engine would not make this decision from rows alone."""
     if entry.kind == JournalKind.MISMATCH:
         return False
     if entry.kind == JournalKind.FIT_REQUESTED:
@@ -255,7 +255,7 @@ def _from_outside(entry: JournalEntry) -> bool:
 
 
 def _held(entry: JournalEntry, what: str) -> dict[str, object]:
-    """Return the JSON object a journal entry holds."""
+    """Return the JSON object of a journal entry."""
     try:
         held = json.loads(entry.text)
     except ValueError:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the running curve expects, row by row, and by how much the plant differs."""
+"""The power expected from a curve, row by row, and the residual of the plant."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ANSWER, _AVERAGE = range(2)
 
 
 class PredictionState(enum.IntEnum):
-    """What a residual is worth; the same numbers stand in the message."""
+    """The validity of a residual; the message uses the same numbers."""
 
     UNKNOWN = 0
     TRANSIENT = 1
@@ -45,20 +45,20 @@ class PredictionBlock:
     ----------
     time_ns : int64
     u : float64
-        What the curve is a function of: integrated input, % MPa^m, or opening, %.
+        Argument of the curve: integrated input, % MPa^m, or opening, %.
     measured_mw, static_mw, dynamic_mw, residual_mw : float64
         NaN where unknown. The residual is measured minus dynamic prediction, or
         minus static prediction in settled rows when no dynamics are known.
     average_mw : float64
         The running mean of the residual; NaN before the first.
     evidence : float64
-        What the alarm judges: beyond 1 or -1 the plant has left the curve; NaN before the first.
+        Input of the alarm: beyond 1 or -1 the plant has left the curve; NaN before the first.
     shift_mw : float64
-        By how much, as the evidence sees it.
+        The shift in MW that corresponds to the evidence.
     state : uint8
         A `PredictionState`.
     width_mw : float
-        95 % of single measurements lie within +- this of the prediction; NaN without a curve.
+        95 % of the measurements lie within +- this of the prediction; NaN without a curve.
     model_id : str
     """
 
@@ -81,24 +81,24 @@ class PredictionBlock:
 
 
 class _Filter(NamedTuple):
-    """The curve, the dynamics and the filter's state."""
+    """The curve, the dynamics and the state of the filter."""
 
     knots: FloatArray
     left: FloatArray
     right: FloatArray
     offset: float  # MW
     levels: FloatArray
-    taps: FloatArray  # (I, 7), empty when the dynamics are not known
+    taps: FloatArray  # (I, 7), empty if the dynamics are unknown
     settle: int  # rows
     forget: float
-    gap_ns: int  # rows further apart than this have a gap between them
-    place: IntArray  # rows since the last gap, place in the ring, time of the last row
-    memory: FloatArray  # filter's answer, mean of the residual
-    past: FloatArray  # ring of flows
+    gap_ns: int  # rows with a larger time difference are separated by a gap
+    place: IntArray  # rows since the last gap, index in the ring buffer, time of the last row
+    memory: FloatArray  # filter output, mean of the residual
+    past: FloatArray  # ring buffer of flows
 
 
 class _Columns(NamedTuple):
-    """What is written for each row."""
+    """The output arrays, one value per row."""
 
     static: FloatArray
     dynamic: FloatArray
@@ -109,7 +109,7 @@ class _Columns(NamedTuple):
 
 @jit
 def _filter(f: _Filter, x: float) -> None:
-    """Put one flow through the dynamics of its region."""
+    """Filter one flow value with the dynamics of its region."""
     age = f.place[_AGE]
     place = f.place[_PLACE]
     f.past[place] = x
@@ -171,7 +171,7 @@ def _predict(
 
 
 class Predictor(Memory):
-    """Predict from one curve, recursively, in constant time a row.
+    """Predict from one curve, recursively, in constant time per row.
 
     Parameters
     ----------
@@ -179,14 +179,14 @@ class Predictor(Memory):
     step_s : float
         Step of the rows.
     settle_s : float
-        After a gap the dynamic prediction is not trusted for this long.
+        Time after a gap until the dynamic prediction is valid.
     average_s : float
         Time constant of the residual's running mean.
     limit_mw : float
-        Where above zero, the evidence is the running mean's share of this limit; otherwise it is
-        that of the chart that came with the curve.
+        If above zero, the evidence is the running mean divided by this limit; otherwise it is
+        that of the control chart of the curve.
     exponent : float
-        m of the u = V p^m that rows come with.
+        m of the u = V p^m in the rows.
     """
 
     REMEMBERED = ('_place', '_memory', '_past', '_chart')
@@ -221,7 +221,7 @@ class Predictor(Memory):
 
     @classmethod
     def of(cls, characteristic: Characteristic, settings: Settings) -> Predictor:
-        """Return what predicts from a curve with these settings."""
+        """Return the predictor for a curve with these settings."""
         return cls(
             characteristic, settings.real('sample_period'), settings.settle_s,
             settings.real('alarm_average'), settings.real('alarm_limit'),
@@ -229,18 +229,18 @@ class Predictor(Memory):
         )  # fmt: skip
 
     def configure(self, settings: Settings) -> None:
-        """Take the fixed limit and the time constant of the running mean; the mean goes on."""
+        """Apply the fixed limit and the time constant of the running mean; the mean continues."""
         self.limit_mw = settings.real('alarm_limit')
         forget = math.exp(-settings.real('sample_period') / settings.real('alarm_average'))
         self._filter = self._filter._replace(forget=forget)
 
     @property
     def warm_up_rows(self) -> int:
-        """Return how many rows bring the filter into its stride."""
+        """Return the number of rows until the filter has settled."""
         return 2 * self._filter.settle + 1
 
     def follow(self, other: Predictor) -> None:
-        """Take over the evidence that an earlier curve's chart had gathered."""
+        """Copy the evidence that the chart of an earlier curve had accumulated."""
         if self._chart is not None and other._chart is not None:
             self._chart.follow(other._chart)
 
@@ -248,7 +248,7 @@ class Predictor(Memory):
         self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray,
         opening_percent: FloatArray | None = None,
     ) -> None:  # fmt: skip
-        """Run over rows of the past; the residual's mean starts afresh afterwards."""
+        """Run over past rows; the mean of the residual is reset afterwards."""
         kinds = np.full(len(u), SETTLED_STEADY, dtype=np.uint8)
         self._rows(time_ns, *self._input(u, opening_percent), power_mw, kinds)
         self._filter.memory[_AVERAGE] = math.nan
@@ -257,9 +257,9 @@ class Predictor(Memory):
         self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray,
         opening_percent: FloatArray | None = None,
     ) -> PredictionBlock:  # fmt: skip
-        """Predict rows of shape (n,); ``kinds`` are the segmenter's.
+        """Predict rows of shape (n,); ``kinds`` are those of the segmenter.
 
-        ``u`` is V p^m. Another form than that needs the opening, and has no data without.
+        ``u`` is V p^m. Curves with another input need the opening, and give no data without it.
         """
         u, scale = self._input(u, opening_percent)
         out = self._rows(time_ns, u, scale, power_mw, kinds)
@@ -277,7 +277,7 @@ class Predictor(Memory):
     def _input(
         self, u: FloatArray, opening_percent: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what the curve is a function of, and what it is multiplied by."""
+        """Return the argument of the curve and its factor."""
         if opening_percent is None:
             opening_percent = np.full(len(u), math.nan)
         x, scale = self._form.of_integrated_input(u, opening_percent, self._exponent)
@@ -296,9 +296,9 @@ class Predictor(Memory):
 
 
 def as_measured(block: PredictionBlock, measured_mw: FloatArray) -> PredictionBlock:
-    """Return the predictions of corrected rows as predictions of what was measured.
+    """Return the predictions of corrected rows as predictions of the measured power.
 
-    The residual stays; what the correction took out of the power is put back on both sides.
+    The residual stays; the correction of the power is undone in measurement and prediction.
     """
     taken_out = measured_mw - block.measured_mw
     return replace(
@@ -310,7 +310,7 @@ def as_measured(block: PredictionBlock, measured_mw: FloatArray) -> PredictionBl
 def no_prediction(
     time_ns: IntArray, u: FloatArray, power_mw: FloatArray, kinds: ByteArray
 ) -> PredictionBlock:
-    """Return the block for rows before there is a curve."""
+    """Return the block for rows without a curve."""
     nan = np.full(len(u), math.nan)
     state = np.where(
         kinds == NO_DATA, int(PredictionState.BAD_DATA), int(PredictionState.UNKNOWN)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the plant is like in health: the reference, what fits may use, and how the valve wears."""
+"""The reference curve of the healthy plant, the rows that fits may use, and the valve wear."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from valveflow_ros.state import State, perhaps
 
 _DAY_NS = 86_400 * NS_PER_S
 MONTH_NS = 30 * _DAY_NS
-# A window that is full to this share counts as a full one.
+# A window that is full to this fraction counts as full.
 _FULL = 0.9
-# Wear is told from so many days on; what was measured of it is kept for so many references.
+# Wear is reported after this many days; its values are kept for this many references.
 _LEAST_WEAR_NS = 20 * _DAY_NS
 _KEPT = 400
 
 
 class Wear(NamedTuple):
-    """How the curve has changed slowly.
+    """The slow change of the curve.
 
     Attributes
     ----------
     since_ns : int
         Middle of the data of the first reference.
     total_mw : float
-        Mean over the segments of the last curve, less that reference.
+        Mean difference of the segments at the last renewal from the first reference.
     mw_per_month : float
-        Slope of a line through what was measured since.
+        Slope of a line through the values since then.
     """
 
     since_ns: int
@@ -50,10 +50,10 @@ class Wear(NamedTuple):
 class ReferenceCurve:
     """Keep the curve of the healthy plant, the alarm on a shift from it, and the wear.
 
-    Where nothing was wrong for `reference_after` behind a curve, it becomes the reference by
-    itself, and so do later ones: the reference follows slow wear, but never a fault, and never
-    further from the first one than `wear_budget` allows. From the onset of a fault on fits use
-    no row from before it, and from its end on none of it: no curve mixes both.
+    A curve becomes the reference automatically if no fault occurs for `reference_after` after it.
+    Later curves replace it in the same way: the reference follows slow wear, but never a fault,
+    and stays within `wear_budget` of the first one. During a fault, fits use only rows after its
+    onset, and afterwards only rows after its end: no curve mixes both.
 
     Parameters
     ----------
@@ -62,19 +62,19 @@ class ReferenceCurve:
     Attributes
     ----------
     curve : Characteristic or None
-        What later curves are judged against.
+        Later curves are judged against it.
     first : Characteristic or None
-        The first one, or the last that was set; wear counts from it.
+        The first one, or the last one set by a user; wear is relative to it.
     shift : Shift or None
         The last judgement.
     problem : str
         Why a curve could not be judged.
     fault_ns : int or None
-        Onset of what is wrong; 0 where it is not known, None if nothing is.
+        Onset of the current fault; 0 if unknown, None if there is no fault.
     regime_ns : int
         Fits use rows from this time on.
     set_ns : int
-        When the reference was set from outside last; 0 before.
+        Time when the reference was last set by a user; 0 if never.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -85,14 +85,14 @@ class ReferenceCurve:
         self.fault_ns: int | None = None
         self.regime_ns = 0
         self.set_ns = 0
-        self._healthy_ns = 0  # where the regime before the fault began
-        self._since_ns = 0  # since when the curve has shifted, while the alarm stands
+        self._healthy_ns = 0  # regime_ns before the fault
+        self._since_ns = 0  # onset of the curve shift, while the alarm stands
         self.first: Characteristic | None = None
         self._candidate: tuple[int, Characteristic] | None = None
         self._worn: list[tuple[int, float]] = []
 
     def snapshot(self) -> State:
-        """Return what is remembered. The last judgement is not."""
+        """Return the state, without the last judgement."""
         candidate = self._candidate
         return {
             'curve': None if self.curve is None else to_json(self.curve),
@@ -106,7 +106,7 @@ class ReferenceCurve:
         }
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         self.curve = None if saved['curve'] is None else from_json(saved['curve'])
         self.problem = saved['problem']
         self.alarm.restore(saved['alarm'])
@@ -123,9 +123,9 @@ class ReferenceCurve:
         self._worn = [(int(ns), float(mw)) for ns, mw in saved['worn']]
 
     def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
-        """Take ``curve`` for the plant in health, whatever was wrong.
+        """Make ``curve`` the reference, even if there is a fault.
 
-        Later curves are judged against it, and fits get its form.
+        Later curves are judged against it, and fits use its form.
         """
         self._take(curve)
         self.set_ns, self.first, self._worn = time_ns, curve, []
@@ -139,13 +139,13 @@ class ReferenceCurve:
         time_ns: int,
         settings: Settings,
     ) -> tuple[Shift | None, list[AlarmChange]]:
-        """Judge a curve that was adopted; None without a reference it can be compared with.
+        """Judge an adopted curve; the shift is None without a comparable reference.
 
         Parameters
         ----------
         current : Characteristic
         segments : sequence of SpecialSegment
-            Those of the window, in order of time.
+            The segments of the window, in order of time.
         time_ns : int
         settings : Settings
         """
@@ -153,9 +153,9 @@ class ReferenceCurve:
         if self.curve is None:
             return None, []
         if self.fault_ns is None:
-            # What went wrong before, and is over, is no shift of today.
+            # A fault that is over is not a shift of the present curve.
             segments = [s for s in segments if s.start_ns >= self.regime_ns]
-        # The reference is some days old, in which wear within its budget is no shift.
+        # Since the date of the reference, wear within its budget is not a shift.
         days_ns = current.source.window_end_ns - self.curve.source.window_end_ns
         oldest_ns = 2 * round(settings.real('reference_after') * _DAY_NS)
         worn = settings.real('wear_budget') * min(max(days_ns, 0), oldest_ns) / MONTH_NS
@@ -173,16 +173,16 @@ class ReferenceCurve:
         return self.shift, self.alarm.judge(self.shift, time_ns, settings)
 
     def follow(self, onset_ns: int | None, waits: bool, time_ns: int) -> bool:
-        """Follow whether something is wrong; return whether that has just begun.
+        """Update whether there is a fault; return True if it has just begun.
 
         Parameters
         ----------
         onset_ns : int or None
-            Onset of what is wrong by the residual alarm or a diagnosis, None if nothing is.
+            Onset of a fault found by the residual alarm or a diagnosis, None if there is none.
         waits : bool
-            An alarm has returned, and nobody has acknowledged it.
+            An alarm has returned and is not acknowledged.
         time_ns : int
-            Of the newest row.
+            Time of the newest row.
         """
         onsets = [] if onset_ns is None else [onset_ns]
         if self.alarm.active:
@@ -200,11 +200,11 @@ class ReferenceCurve:
     def renewed(
         self, current: Characteristic, time_ns: int, settings: Settings
     ) -> Characteristic | None:
-        """Return the curve that is to be the reference from now on; None if that is as before."""
+        """Return the curve that becomes the reference now; None if the reference stays."""
         if self.fault_ns is not None or current.source.window_start_ns < self.regime_ns:
             return None
         if self.shift is not None and self.shift.moved:
-            return None  # the next curve tells whether that is an alarm
+            return None  # the next curve decides whether this is an alarm
         if self.first is not None and self._beyond_budget(current, settings):
             self._candidate = None
             worn = self.curve is None or self.curve.model_id != self.first.model_id
@@ -221,7 +221,7 @@ class ReferenceCurve:
     def renew(
         self, curve: Characteristic, segments: Sequence[SpecialSegment], time_ns: int
     ) -> None:
-        """Let a curve be the reference by itself, and note how far it is from the first one."""
+        """Make a curve the reference automatically, and store its distance from the first one."""
         self._take(curve)
         self.first = self.first or curve
         if curve.model_id != self.first.model_id:
@@ -232,7 +232,7 @@ class ReferenceCurve:
                 self._worn = [*self._worn[1 - _KEPT :], (at_ns, worn)]
 
     def take_chart(self, chart: ChartDesign, wander_mw: float) -> None:
-        """Watch the residual of the reference by another chart; the curve stays what it was."""
+        """Use another control chart for the residual of the reference; the curve stays."""
         since_ns, candidate = self._candidate or (0, None)
         self.curve, self.first, candidate = (
             c and replace(c, residuals=replace(c.residuals, chart=chart, wander_mw=wander_mw))
@@ -242,7 +242,7 @@ class ReferenceCurve:
 
     @property
     def wear(self) -> Wear | None:
-        """Return the slow change since the first reference; None while that is not known."""
+        """Return the slow change since the first reference; None if not yet known."""
         if self.first is None or len(self._worn) < 2:
             return None
         source = self.first.source
@@ -260,7 +260,7 @@ class ReferenceCurve:
         self.alarm.forget()
 
     def _beyond_budget(self, current: Characteristic, settings: Settings) -> bool:
-        """Tell whether the curve is further from the first reference than wear may bring it."""
+        """Return True if the curve differs from the first reference by more than its budget."""
         assert self.first is not None
         months = (current.source.window_end_ns - self.first.source.window_end_ns) / MONTH_NS
         most = settings.real('wear_budget') * max(1.0, months) + settings.real('shift_least')

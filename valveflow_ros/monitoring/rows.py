@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What goes into the engine in one call and what comes out of it."""
+"""Input and output of one call of the engine."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from valveflow_ros.records import FloatArray, IntArray, SampleTable, Signal
 from valveflow_ros.signals.static_form import integrated_input
 from valveflow_ros.state import State, perhaps
 
-# Rows freed of causes that are known, before the engine sees them.
+# Removal of known causes from rows, before the engine uses them.
 #
-# A corrector turns rows of a plant with a fault, a drift or an effect the model lacks into those
-# of a plant without it: segmenter, fit, prediction and alarms then work as they always do.
+# A corrector turns rows of a plant with a fault, a drift or an effect that the model lacks into
+# those of a plant without it: segmenter, fit, prediction and alarms need no change.
 
 
 class Corrector(Protocol):
-    """What takes causes out of rows.
+    """An object that removes causes from rows.
 
-    Rows come in order of time, cut into blocks of any size, which must not matter; what is
-    remembered of them is bounded.
+    Rows come in order of time, in blocks of any size; the result does not depend on the blocks.
+    The state has a bounded size.
     """
 
     @property
     def held(self) -> tuple[HeldCause, ...]:
-        """Return the causes that are taken out."""
+        """Return the causes that are removed."""
         ...
 
     def correct(self, table: SampleTable) -> SampleTable:
-        """Return as many rows with opening and power as they were without the causes.
+        """Return the same number of rows, with opening and power as without the causes.
 
-        Pressure and temperature stay as measured, so that u = V p^m holds for the rows
-        returned. A value that cannot be told is NaN and `BAD`.
+        Pressure and temperature stay as measured, so that u = V p^m holds for the returned
+        rows. An unknown value is NaN and `BAD`.
         """
         ...
 
@@ -48,26 +48,26 @@ class Corrector(Protocol):
         ...
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state."""
         ...
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         ...
 
 
 class Correction:
-    """Hand each row to a corrector once, though the engine may be offered it twice.
+    """Correct each row only once, although the engine may receive it twice.
 
     Parameters
     ----------
     corrector : Corrector, optional
-        Without one rows pass as they are.
+        None: rows are not changed.
 
     Notes
     -----
-    The engine stops within a block where it wants a fit, and is given the rest of it
-    again. That rest was corrected already; it is kept until the rows go beyond it.
+    The engine stops within a block if it requests a fit, and receives the rest of the block
+    again. That rest was corrected before; it is kept until newer rows arrive.
     """
 
     def __init__(self, corrector: Corrector | None = None) -> None:
@@ -76,21 +76,21 @@ class Correction:
 
     @property
     def corrector(self) -> Corrector | None:
-        """Return what changes the rows; None if nothing does."""
+        """Return the corrector; None if rows are not changed."""
         return self._corrector
 
     @property
     def on(self) -> bool:
-        """Tell whether rows are changed."""
+        """Return True if rows are changed."""
         return self._corrector is not None
 
     @property
     def held(self) -> tuple[HeldCause, ...]:
-        """Return the causes that are taken out."""
+        """Return the causes that are removed."""
         return () if self._corrector is None else self._corrector.held
 
     def rows(self, table: SampleTable) -> SampleTable:
-        """Return the rows corrected, of the same number."""
+        """Return the corrected rows, of the same number."""
         if self._corrector is None or not len(table):
             return table
         parts: list[SampleTable] = []
@@ -108,7 +108,7 @@ class Correction:
         return self._ahead
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state."""
         ahead = self._ahead
         return {
             'corrector': None if self._corrector is None else self._corrector.snapshot(),
@@ -116,7 +116,7 @@ class Correction:
         }
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raises `DataError` if it does not fit."""
         if (self._corrector is None) != (saved['corrector'] is None):
             raise DataError('The saved state was made with another model_file.')
         if self._corrector is not None:
@@ -133,13 +133,13 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class Fed:
-    """What one call of `Monitor.feed` did.
+    """The result of one call of `Monitor.feed`.
 
     Attributes
     ----------
     rows : int
-        Rows taken. Fewer than given after a `FitRequested`: whoever computes
-        fits in place hands the outcome back before the rest is fed.
+        Number of rows taken. It is smaller than given after a `FitRequested`: a caller that
+        computes fits at once returns the outcome before the rest is fed.
     events : list of Event
         In the order in which they happened.
     """
@@ -173,7 +173,7 @@ class Rows:
 
     @classmethod
     def of(cls, table: SampleTable, exponent: float, correction: Correction | None = None) -> Rows:
-        """Return the columns the engine works on, u of eq. (1) among them."""
+        """Return the columns that the engine uses, including u of eq. (1)."""
         if correction is not None and correction.on:
             measured = np.ascontiguousarray(table.column(Signal.GENERATED_POWER))
             return CorrectedRows(cls.of(correction.rows(table), exponent), measured)
@@ -189,12 +189,12 @@ class Rows:
         return cls(table.time_ns, u, power, temperature, opening, command)
 
     def shown(self, block: PredictionBlock) -> PredictionBlock:
-        """Return what is predicted of these rows in terms of the power that was measured."""
+        """Return the predictions of these rows for the measured power."""
         return block
 
 
 class CorrectedRows(Rows):
-    """Rows freed of causes, with the power as it was measured.
+    """Rows with causes removed, and the measured power.
 
     Parameters
     ----------
@@ -217,5 +217,5 @@ class CorrectedRows(Rows):
         return CorrectedRows(Rows.part(self, start, end), self.measured_mw[start:end])
 
     def shown(self, block: PredictionBlock) -> PredictionBlock:
-        """Return the predictions with what the correction took out put back."""
+        """Return the predictions with the correction undone."""
         return as_measured(block, self.measured_mw)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What Prometheus is told of each unit, from the same pictures that the page shows."""
+"""Prometheus metrics of each unit, from the same snapshots as the page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from valveflow_ros.report.terminal.board import AGE
 from valveflow_ros.report.terminal.frame import OK, SampleView
 
 _W = 1e6
-# Keys of the health's values that become counters: of inputs, and of the recorder.
+# Keys in the health values that become counters: of inputs, and of the recorder.
 _INPUT_COUNTS = {
     'valveflow_input_messages': ('Messages received', 'Messages of an input that were received.'),
     'valveflow_input_messages_lost': (
@@ -36,14 +36,14 @@ _RECORDER_COUNTS = {
 
 
 class Metrics:
-    """Writes the metrics of what is shown.
+    """Provides the metrics of the shown units.
 
     Parameters
     ----------
     shown : Shown
     counters : callable, optional
         Returns further counters of the process by name, without ``_total``, each with its help
-        and its value.
+        text and its value.
     """
 
     def __init__(
@@ -55,15 +55,15 @@ class Metrics:
         self._registry.register(self)
 
     def text(self) -> bytes:
-        """Return the metrics in Prometheus' text format, UTF-8."""
+        """Return the metrics in the text format of Prometheus, UTF-8."""
         return bytes(generate_latest(self._registry))
 
     def describe(self) -> Iterable[Metric]:
-        """Return nothing: what there is depends on the units."""
+        """Return nothing: the metrics depend on the units."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every metric; a number that is not known is left out."""
+        """Yield every metric; unknown numbers are left out."""
         units = _named(self._shown.units)
         yield from _samples(units)
         yield from _curves(units)
@@ -80,7 +80,7 @@ Named = list[tuple[str, Snapshot]]
 
 
 def _named(units: tuple[Snapshot, ...]) -> Named:
-    """Return the units with a label each; of two with the same tag, with the monitor's name."""
+    """Return the units with labels; units with the same tag also get the name of the monitor."""
     titles = [unit.title for unit in units]
     return [(u.title if titles.count(u.title) == 1 else u.key, u) for u in units]
 
@@ -143,7 +143,7 @@ def _levels(units: Named) -> Metric:
     for name, unit in units:
         known = {item.health.name: item.health.level for item in unit.items}
         if not known:
-            # A recording holds no diagnostics; its readings tell of the inputs.
+            # A recording contains no diagnostics; its readings give the state of the inputs.
             known = {f'input {item.name}': item.level for item in unit.frame.inputs}
             known['recorder'] = OK if unit.frame.recorder is None else unit.frame.recorder.level
         for item, level in known.items():
@@ -176,7 +176,7 @@ def _counts(units: Named) -> Iterator[Metric]:
 
 
 def _number(unit: Snapshot, item: str, key: str) -> float:
-    """Return a number of the health, NaN where it is not told."""
+    """Return a number of the health, NaN if missing."""
     found = next((i for i in unit.items if i.health.name == item), None)
     return math.nan if found is None else _float(found.values.get(key))
 

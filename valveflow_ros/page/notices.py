@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A command or a webhook for each change of an alarm: bounded, tried again, never waited for."""
+"""A command or a webhook for each alarm change: bounded queue, retries, never blocking."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from valveflow_ros.errors import UsageError
 from valveflow_ros.page.unit import AlarmChange
 from valveflow_ros.records import NS_PER_S
 
-# Notices that wait; when another comes, the oldest is dropped and counted.
+# Maximum number of waiting notices; a new one replaces the oldest, which is counted.
 MOST_WAITING = 64
-# How long one try may take, and the pauses before each further try.
+# Time limit of one attempt, and the pauses before each further attempt.
 LIMIT_S = 10.0
 PAUSES_S = (2.0, 10.0, 60.0)
 _LAST_S = 1.0
@@ -34,16 +34,16 @@ STATES = ('normal', 'unacknowledged', 'acknowledged', 'returned_unacknowledged',
 
 
 class DeliveryError(Exception):
-    """A try has failed; the text says why."""
+    """An attempt has failed; the text says why."""
 
 
 Deliver = Callable[[bytes], None]
 
 
 def notice(change: AlarmChange) -> bytes:
-    """Return what is sent for a change: a JSON object, UTF-8.
+    """Return the notice for a change: a JSON object, UTF-8.
 
-    Its fields: ``unit``, ``monitor``, ``alarm``, ``state``, ``previous_state`` (null: not known),
+    Its fields: ``unit``, ``monitor``, ``alarm``, ``state``, ``previous_state`` (null: unknown),
     ``sentence``, ``time`` and ``raised`` (ISO 8601, UTC; null: none).
     """
     previous = change.previous
@@ -70,16 +70,16 @@ def _time(time_ns: int) -> str | None:
 
 
 class Sender:
-    """Delivers notices in their order, in a thread of its own.
+    """Delivers notices in order, in a separate thread.
 
     Parameters
     ----------
     deliver : callable
-        Delivers one, or raises `DeliveryError`; it must end by itself.
+        Delivers one notice, or raises `DeliveryError`; it must not block without limit.
     pauses_s : sequence of float
-        Pauses before each further try, in seconds; then the notice is given up.
+        Pauses before each further attempt, in seconds; after the last one the notice is dropped.
     complain : callable
-        Takes a sentence on each failure.
+        Called with a sentence on each failure.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Sender:
         self._thread.start()
 
     def put(self, content: bytes) -> None:
-        """Take a notice at once; the oldest that waits is dropped if there are too many."""
+        """Queue a notice without waiting; if the queue is full, the oldest one is dropped."""
         with self._ready:
             if len(self._waiting) >= MOST_WAITING:
                 self._waiting.popleft()
@@ -108,7 +108,7 @@ class Sender:
             self._ready.notify()
 
     def close(self, patience_s: float = 0.0) -> None:
-        """End; what has not been delivered within ``patience_s`` is not delivered."""
+        """Stop; notices that are not delivered within ``patience_s`` are lost."""
         with self._ready:
             self._ready.notify()
             self._ready.wait_for(lambda: not self._waiting, timeout=patience_s)
@@ -130,7 +130,7 @@ class Sender:
                 self.failed += 1
 
     def _tried(self, content: bytes) -> bool:
-        """Return True once it was delivered, False when it is given up."""
+        """Return True after delivery, False after the last failed attempt."""
         for pause_s in (*self._pauses_s, None):
             try:
                 self._deliver(content)
@@ -144,12 +144,12 @@ class Sender:
 
 
 def command(line: str, limit_s: float = LIMIT_S) -> Deliver:
-    """Return what runs a command with the notice on its standard input; no shell is involved.
+    """Return a function that runs a command with the notice on its standard input, without shell.
 
     Raises
     ------
     UsageError
-        The line cannot be read as a command.
+        The line cannot be parsed as a command.
     """
     try:
         words = shlex.split(line)
@@ -169,7 +169,7 @@ def command(line: str, limit_s: float = LIMIT_S) -> Deliver:
         try:
             process.communicate(content, timeout=limit_s)
         except subprocess.TimeoutExpired:
-            # With whatever it started.
+            # Including its child processes.
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
@@ -181,12 +181,12 @@ def command(line: str, limit_s: float = LIMIT_S) -> Deliver:
 
 
 def webhook(url: str, limit_s: float = LIMIT_S) -> Deliver:
-    """Return what sends the notice by HTTP POST; redirections are not followed.
+    """Return a function that sends the notice by HTTP POST; redirections are not followed.
 
     Raises
     ------
     UsageError
-        It is no address of HTTP or HTTPS.
+        It is not an address of HTTP or HTTPS.
     """
     wrong = f"--webhook must be an address such as https://host/path; '{url}' is not."
     try:
@@ -205,7 +205,7 @@ def webhook(url: str, limit_s: float = LIMIT_S) -> Deliver:
         late = threading.Event()
 
         def end() -> None:
-            # A peer that sends a byte now and then would hold us for ever.
+            # Limits the total time, also if the peer sends single bytes slowly.
             late.set()
             if connection.sock is not None:
                 with suppress(OSError):
@@ -233,19 +233,19 @@ def webhook(url: str, limit_s: float = LIMIT_S) -> Deliver:
 
 
 class Notices:
-    """Tells each change of an alarm to a command, to a webhook, to both or to none.
+    """Reports each alarm change to a command, to a webhook, to both or to none.
 
     Parameters
     ----------
     line, url : str or None
-        The command and the address; None: not wanted.
+        The command and the address; None if not used.
     complain : callable
-        Takes a sentence on each failure.
+        Called with a sentence on each failure.
 
     Raises
     ------
     UsageError
-        The command or the address cannot be used.
+        The command or the address is invalid.
     """
 
     def __init__(self, line: str | None, url: str | None, complain: Callable[[str], None]) -> None:
@@ -254,13 +254,13 @@ class Notices:
         self._senders = [Sender(deliver, complain=complain) for deliver in makers]
 
     def tell(self, changes: Iterable[AlarmChange]) -> None:
-        """Take changes; returns at once."""
+        """Queue changes; returns immediately."""
         for change in changes if self._senders else ():
             for sender in self._senders:
                 sender.put(notice(change))
 
     def counters(self) -> dict[str, tuple[str, float]]:
-        """Return what became of the notices, by name of the counter: its help and its value."""
+        """Return counters of the notices by name: help text and value."""
         return {
             f'valveflow_notices_{name}': (
                 f'Notices of alarms {about}.', float(sum(getattr(s, name) for s in self._senders))
@@ -270,6 +270,6 @@ class Notices:
         }  # fmt: skip
 
     def close(self) -> None:
-        """End; what waits has a moment to be delivered."""
+        """Stop; waiting notices have a short time for delivery."""
         for sender in self._senders:
             sender.close(_LAST_S)

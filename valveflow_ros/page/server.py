@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The web server of the page: what it listens to, whom it answers, and its limits."""
+"""The web server of the page: its address, its access control, and its limits."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from valveflow_ros.errors import (
 if TYPE_CHECKING:
     from datetime import tzinfo
 
-    # A verb that only names the options need not load it.
+    # A verb that only lists the options does not need it.
     from valveflow_ros.page.unit import Shown
 
 PORT = 8350
-# Open connections beyond which the answer is 503, and beyond which none is accepted.
+# Numbers of open connections above which the answer is 503, and above which none is accepted.
 MOST_CONNECTIONS, _MOST_ACCEPTED = 256, 320
-# How long a connection may be idle, or stuck in a request or an answer; how long an answer may
-# take in all.
+# Time limits of a connection that is idle or stuck in a request or an answer; time limit of a
+# whole answer.
 IDLE_S, _LONGEST_S = 20, 120.0
 _SWEEP_S = 5.0
 _MOST_HEAD, _MOST_BODY = 16384, 65536
@@ -58,7 +58,7 @@ Wsgi = Callable[[dict[str, Any], Start], Iterable[bytes]]
 
 
 def check_installed() -> None:
-    """Return if everything is there that only the page needs; raises `DataError`."""
+    """Raise `DataError` if a package that only the page needs is missing."""
     missing = [name for module, name in _NEEDS.items() if find_spec(module) is None]
     if missing:
         raise DataError(
@@ -68,7 +68,7 @@ def check_installed() -> None:
 
 
 def page_arguments(parser: ArgumentParser) -> None:
-    """Add the options that say where the page is and whom it tells."""
+    """Add the options on the address of the page and its notices."""
     parser.add_argument(
         '--host', metavar='ADDRESS', default='127.0.0.1',
         help='address to listen on (default 127.0.0.1: this machine only)',
@@ -107,7 +107,7 @@ def read_token(path: Path) -> str:
     RecordingError
         The file cannot be read.
     InputError
-        The token is too short to be one.
+        The token is too short.
     """
     try:
         with path.open(encoding='utf-8') as file:
@@ -119,15 +119,15 @@ def read_token(path: Path) -> str:
     return token
 
 
-# Whom it answers.
+# Access control.
 
 
 class Guard:
-    """Answers browsers of the page itself and Prometheus, and refuses everything else.
+    """Answers requests of the page itself and of Prometheus, and rejects all others.
 
-    A page of another site may be open in the same browser, also under a name that its owner lets
-    point to this machine: so the name asked for must be ours, and a request that says where it
-    comes from must come from here.
+    A page of another site may be open in the same browser, also under a host name that its owner
+    directs to this machine (DNS rebinding). So the requested host must be one of ours, and a
+    request with an origin must have ours.
 
     Parameters
     ----------
@@ -137,11 +137,11 @@ class Guard:
     metrics : callable
         Returns the metrics as text.
     names : sequence of str
-        Names of this machine beside its addresses and its host name.
+        Names of this machine in addition to its addresses and its host name.
     connections : callable
-        Returns how many connections are open.
+        Returns the number of open connections.
     complain : callable
-        Takes a sentence where a request could not be answered, at most once a minute.
+        Called with a sentence if a request could not be answered, at most once a minute.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class Guard:
         """Answer a request."""
         try:
             refusal = self._refusal(environ)
-        except ValueError:  # an address that is none
+        except ValueError:  # an invalid address
             refusal = ('403 Forbidden', 'This request does not come from the page.')
         if refusal is not None:
             self.refused += 1
@@ -204,7 +204,7 @@ class Guard:
             return self._say(start, '400 Bad Request', 'This request cannot be answered.')
 
     def _refusal(self, environ: dict[str, Any]) -> tuple[str, str] | None:
-        """Return status and sentence for a request that is not answered."""
+        """Return status and sentence for a rejected request; None if it is allowed."""
         host = str(environ.get('HTTP_HOST', ''))
         path = str(environ.get('PATH_INFO', ''))
         wanted = 'GET' if path.startswith(_STATIC) else _PATHS.get(path)
@@ -232,7 +232,7 @@ class Guard:
             return False
         if name in self._names:
             return True
-        # An address cannot be made to point elsewhere.
+        # An IP address cannot be redirected by DNS.
         with suppress(ValueError):
             return bool(ipaddress.ip_address(name))
         return False
@@ -246,7 +246,7 @@ class Guard:
         return [body]
 
     def _asked(self, environ: dict[str, Any], begin: Start, start: Start) -> Iterable[bytes]:
-        """Return the library's answer; where it is an error, its number and a sentence."""
+        """Return the answer of the library; if it is an error, its status and a sentence."""
         status, head, body = _whole(self._application, environ)
         if status[0] in '45':
             self.refused += 1
@@ -257,7 +257,7 @@ class Guard:
     def _file(
         self, path: str, environ: dict[str, Any], begin: Start, start: Start
     ) -> Iterable[bytes]:
-        """Return a file of the library; each is kept once, whoever reads it and however slowly."""
+        """Return a file of the library; each is compressed and stored once for all readers."""
         if 'gzip' not in str(environ.get('HTTP_ACCEPT_ENCODING', '')):
             return self._asked(environ, begin, start)
         if path not in self._static:
@@ -275,7 +275,7 @@ class Guard:
 
 
 def _whole(application: Wsgi, environ: dict[str, Any]) -> tuple[str, Any, bytes]:
-    """Return an answer as status, head and body."""
+    """Return an answer as status, header and body."""
     kept: list[Any] = []
 
     def start(status: str, head: list[tuple[str, str]], *_: Any) -> None:
@@ -295,7 +295,7 @@ def _whole(application: Wsgi, environ: dict[str, Any]) -> tuple[str, Any, bytes]
 
 
 class PageServer:
-    """Serves the page and the metrics in threads of its own.
+    """Serves the page and the metrics in separate threads.
 
     Parameters
     ----------
@@ -303,22 +303,22 @@ class PageServer:
     host : str
         Address to listen on.
     port : int
-        0: any that is free.
+        0: any free port.
     names : sequence of str
         Further names of this machine.
     asking : Asking, optional
-        For whoever may ask a monitor for something.
+        Handles requests of authorised users to a monitor.
     counters : callable, optional
         Further counters for the metrics.
     complain : callable
-        Takes a sentence where a request could not be answered.
+        Called with a sentence if a request could not be answered.
     zone : tzinfo, optional
-        Times are told in it; in UTC without.
+        Time zone of the times; UTC by default.
 
     Raises
     ------
     ValveflowError
-        The address cannot be listened on.
+        The address cannot be used.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ class PageServer:
         complain: Callable[[str], None] = lambda _: None,
         zone: tzinfo | None = None,
     ) -> None:
-        # Whoever else holds the port is told of before the libraries are loaded.
+        # Check the port first: loading the libraries takes time.
         listener = _listener(host, port)
         try:
             from waitress.server import create_server
@@ -344,7 +344,7 @@ class PageServer:
             app, policy = make_app(shown, asking, zone)
             self._sockets: dict[int, Any] = {}
             metrics = Metrics(shown, lambda: {**counters(), **self._counters()})
-            # An error is told by the guard in a sentence.
+            # The guard reports errors as a sentence.
             app.server.config['PROPAGATE_EXCEPTIONS'] = True
             self.guard = Guard(
                 app.server, policy, metrics.text, names, self.connections, complain
@@ -371,18 +371,18 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Return what is typed into a browser on this machine."""
+        """Return the address of the page for a browser on this machine."""
         host = {'0.0.0.0': '127.0.0.1', '::': '::1'}.get(self.host, self.host.strip('[]'))
         return f'http://{f"[{host}]" if ":" in host else host}:{self.port}/'
 
     def connections(self) -> int:
-        """Return how many connections are open."""
+        """Return the number of open connections."""
         return sum(1 for channel in list(self._sockets.values()) if hasattr(channel, 'requests'))
 
     def close(self) -> None:
-        """End; open connections are closed."""
+        """Stop; open connections are closed."""
         self._ended.set()
-        # In the thread that waits for the sockets, so that it need not be waited for.
+        # Done in the thread that waits for the sockets, so that no further waiting is needed.
         with suppress(OSError):
             self._server.trigger.pull_trigger(self._close_all)
         for thread in self._threads:
@@ -398,12 +398,12 @@ class PageServer:
         return {'valveflow_page_requests_refused': ('Requests refused.', self.guard.refused)}
 
     def _run(self) -> None:
-        # At the end its sockets are closed under it.
+        # At the end the sockets are closed during the wait.
         with suppress(OSError, ValueError):
             self._server.run()
 
     def _sweep(self) -> None:
-        """End connections that hold a request or an answer for too long."""
+        """Close connections that hold a request or an answer for too long."""
         since: dict[int, tuple[object, float]] = {}
         while not self._ended.wait(_SWEEP_S):
             now_s, still = time.monotonic(), {}
@@ -418,14 +418,14 @@ class PageServer:
                 idle = time.time() - channel.last_activity > IDLE_S
                 limit_s = _LONGEST_S if slow else float(IDLE_S)
                 if now_s - begun_s > limit_s or (slow and idle):
-                    # The server's own thread sees the end and cleans up.
+                    # The thread of the server then detects the end and cleans up.
                     with suppress(OSError):
                         channel.socket.shutdown(socket.SHUT_RDWR)
             since = still
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound; raises `ValveflowError`."""
+    """Return a bound socket; raises `ValveflowError`."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host.strip('[]'), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -436,7 +436,7 @@ def _listener(host: str, port: int) -> socket.socket:
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         made.bind(address)
-        # Two that listen on one port are told apart only when both do.
+        # With SO_REUSEADDR a second socket on the port fails here, not at bind.
         made.listen(128)
     except OSError as error:
         made.close()
@@ -451,6 +451,6 @@ def _listener(host: str, port: int) -> socket.socket:
 
 
 def _quiet() -> None:
-    """Keep the libraries' own lines off the terminal; what matters is counted and told by us."""
+    """Suppress log messages of the libraries; relevant errors are counted and reported here."""
     for name in ('waitress', 'waitress.queue', 'werkzeug', 'valveflow_page', 'dash'):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)

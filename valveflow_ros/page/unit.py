@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the page keeps of one unit: the picture of `Board`, the last 24 hours, alarm changes."""
+"""The state of one unit for the page: its `Board`, the last 24 hours, alarm changes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from valveflow_ros.report.terminal.frame import NORMAL, AlarmView, Frame, Sample
 
 MINUTE_NS = 60 * NS_PER_S
 MINUTES = 24 * 60
-# Changes that wait to be handed on; more come only where nobody asks for them.
+# Maximum number of waiting changes; it is reached only if nobody reads them.
 _MOST_CHANGES = 256
-# Calls of `Unit.changes` after the first message, in which latched messages still come.
+# Calls of `Unit.changes` after the first message, during which latched messages may arrive.
 _FIRST_CALLS = 4
-# More monitors than that do not fit on a page, nor in its share of a processor.
+# Maximum number of monitors on a page, limited by its size and its processor load.
 MOST_UNITS = 16
 
 
@@ -33,9 +33,9 @@ class Minute:
     start_ns : int
         Begin of the minute, ns since 1970.
     measured_mw, predicted_mw : float
-        Means, MW; NaN: none known.
+        Means, MW; NaN if unknown.
     low_mw, high_mw : float
-        Least and largest measured power, MW; NaN: none known.
+        Lowest and highest measured power, MW; NaN if unknown.
     """
 
     start_ns: int
@@ -46,7 +46,7 @@ class Minute:
 
 
 class Day:
-    """The last 24 hours, a point a minute, in bounded memory."""
+    """The last 24 hours, one point per minute, with bounded memory."""
 
     def __init__(self) -> None:
         self._closed: deque[Minute] = deque(maxlen=MINUTES)
@@ -57,7 +57,7 @@ class Day:
         self._low, self._high = math.inf, -math.inf
 
     def add(self, sample: SampleView) -> None:
-        """Take a sample; where the clock went back, what was kept before is dropped."""
+        """Add a sample; if the clock went back, the earlier ones are dropped."""
         start_ns = sample.time_ns - sample.time_ns % MINUTE_NS
         if start_ns < self._start_ns:
             self._closed.clear()
@@ -75,7 +75,7 @@ class Day:
                 self._sum_predicted += sample.measured_mw - sample.residual_mw
 
     def view(self) -> tuple[Minute, ...]:
-        """Return the minutes that are over, oldest first; the same object until one is added."""
+        """Return the complete minutes, oldest first; the same object until one is added."""
         while self._closed and self._closed[0].start_ns <= self._start_ns - MINUTES * MINUTE_NS:
             self._closed.popleft()
         ends = (self._closed[0], self._closed[-1]) if self._closed else None
@@ -105,18 +105,18 @@ class Day:
 
 @dataclass(frozen=True, slots=True)
 class AlarmChange:
-    """An alarm's state has changed; states are places in `frame.ALARM_STATES`.
+    """A change of the state of an alarm; states are indices in `frame.ALARM_STATES`.
 
     Attributes
     ----------
     unit, monitor : str
         Tag of the unit; name of the monitor's node, or of the recording.
     alarm : AlarmView
-        How it stands now.
+        Its present state.
     previous : int or None
-        Its state before; None: not known, because the page was started after that.
+        Its state before; None if unknown, because the page was started later.
     time_ns : int
-        When it changed, ns since 1970.
+        Time of the change, ns since 1970.
     """
 
     unit: str
@@ -128,7 +128,7 @@ class AlarmChange:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A unit at one moment; it never changes, so any thread may read it.
+    """A unit at one time; it is immutable, so any thread may read it.
 
     Attributes
     ----------
@@ -136,11 +136,11 @@ class Snapshot:
         Name of the monitor's node, or of the recording.
     frame : Frame
     day : tuple of Minute
-        The last 24 hours without the minute that is not over; the same object while unchanged.
+        The last 24 hours without the current minute; the same object while unchanged.
     items : tuple of ItemView
-        All health items with their numbers.
+        All health items with their values.
     present : bool
-        False: the monitor has gone.
+        False if the monitor is no longer present.
     """
 
     key: str
@@ -151,12 +151,12 @@ class Snapshot:
 
     @property
     def title(self) -> str:
-        """Return what a person calls the unit."""
+        """Return the displayed name of the unit."""
         return self.frame.unit or self.key
 
 
 class Unit(Board):
-    """The state of one monitor as the page needs it, in bounded memory.
+    """The state of one monitor for the page, with bounded memory.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class Unit(Board):
         self._calls = 0
 
     def take(self, type_name: str, fields: Mapping[str, Any]) -> None:
-        """Take a message; one of another type changes nothing."""
+        """Process a message; messages of other types are ignored."""
         super().take(type_name, fields)
         if type_name == PREDICTION and self._samples:
             self._day.add(self._samples[-1])
@@ -181,13 +181,13 @@ class Unit(Board):
             self._note_change(str(fields['name']), fields['header']['stamp'])
 
     def snapshot(self, frame: Frame, present: bool = True) -> Snapshot:
-        """Return how it is now."""
+        """Return the current state."""
         return Snapshot(self.key, frame, self._day.view(), self.items, present)
 
     def changes(self) -> list[AlarmChange]:
-        """Return the changes of alarms since the last call, oldest first.
+        """Return the alarm changes since the last call, oldest first.
 
-        The first calls tell only what stands: what a late listener is given first is history.
+        The first calls return only standing alarms: the first messages that arrive are history.
         """
         told = list(self._changes)
         self._changes.clear()
@@ -199,7 +199,7 @@ class Unit(Board):
 
     @property
     def _settled(self) -> bool:
-        """Return True once what was latched has come."""
+        """Return True after the latched messages have arrived."""
         return self._calls >= _FIRST_CALLS
 
     def _note_change(self, name: str, stamp: Mapping[str, Any]) -> None:
@@ -209,7 +209,7 @@ class Unit(Board):
             return
         self._states[name] = alarm.state
         if before is None and alarm.state == NORMAL:
-            # A monitor that starts says so of each alarm; that is nothing to be called for.
+            # A starting monitor announces the normal state of each alarm; this needs no notice.
             return
         time_ns = int(stamp['sec']) * NS_PER_S + int(stamp['nanosec'])
         self._changes.append(
@@ -218,14 +218,14 @@ class Unit(Board):
 
 
 class Shown:
-    """What the page shows at this moment: handed over by one thread, read by others."""
+    """The content of the page at this time: set by one thread, read by others."""
 
     def __init__(self) -> None:
         self._both: tuple[tuple[Snapshot, ...], str] = ((), '')
 
     def put(self, units: Iterable[Snapshot], note: str = '') -> None:
         """Replace everything; at most `MOST_UNITS` units are kept."""
-        # One assignment, so that nobody reads the one without the other.
+        # A single assignment, so that readers always get a consistent pair.
         self._both = (tuple(units)[:MOST_UNITS], note)
 
     @property
@@ -235,5 +235,5 @@ class Shown:
 
     @property
     def note(self) -> str:
-        """Return a sentence that stands above all, empty if there is none."""
+        """Return a sentence for the top of the page, empty if there is none."""
         return self._both[1]

@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The page itself: words and pictures of each unit, made with Dash, brought up to date each tick.
+"""The page: texts and figures of each unit, made with Dash and updated at each tick.
 
-The server keeps nothing of a browser. Each tick a browser says which version it has of every part,
-and is sent the parts that differ; their text is made once for all browsers.
+The server stores no state per browser. At each tick a browser sends the version of each part that
+it shows, and receives the parts that differ; their content is made once for all browsers.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ from valveflow_ros.report.terminal.text import clean
 from valveflow_ros.report.words import in_zone, input_axis, moment
 
 TICK_MS = 2000
-# The newest samples as they are; what is older is shown a point a minute.
+# The newest samples are shown individually; older ones as one point per minute.
 RECENT_S = 900
 _MOST_RECENT = 300
 _LEVELS = {OK: ('ok', 'good'), WARN: ('look', 'warn'), ERROR: ('fault', 'bad'),
            STALE: ('silent', 'bad')}  # fmt: skip
 PARTS = ('head', 'alarms', 'curve_words', 'now', 'diagnosis', 'health')
 PICTURES = {'curve': 300, 'recent': 250, 'day': 340}
-# What may be asked of a monitor from the page.
+# The requests to a monitor that the page offers.
 ASKED = {
     f'{action} {name}': f'{action.capitalize()} {name}'
     for name in ('residual', 'curve_shift') for action in ('acknowledge', 'shelve')
@@ -67,20 +67,20 @@ _TRIES, _WAIT_S = 5, 30.0
 Ask = Callable[[str, str], tuple[bool, str]]
 
 
-# Words.
+# Texts.
 
 
 def _said(said: Said, zone: tzinfo | None) -> Any:
     text, tone = clean(in_zone(said[0], zone)), said[1]
     first, point, rest = text.partition('. ')
     if tone == 'bad' and rest:
-        # What it is stands out from why.
+        # The state is emphasised, its reason is not.
         return html.P([html.B(first + point), rest], className=tone)
     return html.P(text, className=tone or 'plain')
 
 
 def summary(frame: Frame, present: bool) -> Said:
-    """Return one word on how a unit is, and its tone."""
+    """Return the state of a unit as one word, with its style."""
     if not present:
         return 'no monitor', 'bad'
     states = {alarm.state for alarm in frame.alarms if alarm.standing}
@@ -154,16 +154,16 @@ def words(unit: Snapshot, zone: tzinfo | None = None) -> dict[str, list[Any]]:
 
 
 def _whole_minute(frame: Frame) -> int:
-    """Return the time with which an age need not be told anew each second."""
+    """Return the time rounded to minutes, so that displayed ages do not change every second."""
     end_ns = 0 if frame.curve is None else frame.curve.window[1]
     return max(end_ns, frame.now_ns - frame.now_ns % (60 * NS_PER_S))
 
 
-# Pictures, as `report.figure` makes them: colours by name.
+# Figures, in the format of `report.figure`: colours by name.
 
 
 def curve_picture(frame: Frame) -> Spec:
-    """Return the curve with the last quarter of an hour and today's operating point."""
+    """Return the curve with the last 15 minutes and the present operating point."""
     curve, last = frame.curve, frame.last
     traces = []
     e = math.nan
@@ -190,11 +190,11 @@ def curve_picture(frame: Frame) -> Spec:
 
 
 def _recent(frame: Frame) -> list[Any]:
-    """Return the samples of the last quarter of an hour, thinned to what a picture shows."""
+    """Return the samples of the last 15 minutes, reduced to the number for a figure."""
     begin_ns = frame.now_ns - RECENT_S * NS_PER_S
     found = [s for s in frame.samples if s.time_ns >= begin_ns]
     step = -(-len(found) // _MOST_RECENT) or 1
-    # Counted from the end, so that the newest is always there.
+    # Counted from the end, so that the newest sample is always included.
     return found[::-1][::step][::-1]
 
 
@@ -203,7 +203,7 @@ def _ms(time_ns: int) -> float:
 
 
 def recent_picture(frame: Frame, zone: tzinfo | None = None) -> Spec:
-    """Return prediction and its limits against measurement over the last quarter of an hour."""
+    """Return prediction with its limits and measurement over the last 15 minutes."""
     found = _recent(frame)
     predicted = [s.measured_mw - s.residual_mw for s in found]
     columns = (
@@ -218,7 +218,7 @@ def recent_picture(frame: Frame, zone: tzinfo | None = None) -> Spec:
 
 
 def day_picture(unit: Snapshot, zone: tzinfo | None = None) -> Spec:
-    """Return means of a minute over the last 24 hours, with a strip below to scroll in."""
+    """Return means over a minute for the last 24 hours, with a range slider."""
     day = unit.day
     if len(day) < 2:
         return _empty('A point comes each minute.')
@@ -245,7 +245,7 @@ def day_picture(unit: Snapshot, zone: tzinfo | None = None) -> Spec:
 def _against(
     t: Sequence[float], columns: Sequence[Sequence[float]], band: str, zone: tzinfo | None
 ) -> Spec:
-    """Return a picture over time; columns: measured, predicted, and the edges of a band."""
+    """Return a figure over time; columns: measured, predicted, and the edges of a band."""
     t = t if zone is None else [local_ms(ms, zone) for ms in t]
     measured, predicted, low, high = map(rounded, columns)
     edge: Any = {'line': {'width': 0}, 'showlegend': False}
@@ -255,7 +255,7 @@ def _against(
         line(t, predicted, 'predicted', 'curve', '%{y:.1f} MW predicted<extra></extra>'),
         line(t, measured, 'measured', 'steady', '%{y:.1f} MW measured<extra></extra>', width=1.5),
     ]
-    # No range: one that changes would take away what was scrolled to by hand.
+    # No fixed range: updating it would undo the scrolling of the user.
     across = axis('', type='date', tickangle=0, nticks=6)
     return {
         'data': traces,
@@ -264,31 +264,31 @@ def _against(
 
 
 def _empty(sentence: str) -> Spec:
-    """Return a picture that says why it is empty."""
+    """Return a figure with a sentence on why it is empty."""
     told = {'text': sentence, 'showarrow': False, 'xref': 'paper', 'yref': 'paper', 'x': 0.5,
             'y': 0.5, 'font': {'color': token('muted')}}  # fmt: skip
     hidden = axis('', visible=False)
     return {'data': [], 'layout': {'xaxis': hidden, 'yaxis': hidden, 'annotations': [told]}}
 
 
-# What is sent.
+# The data for the browsers.
 
 
 class Made(NamedTuple):
-    """A part of the page, and a version that differs where the content does."""
+    """A part of the page, and a version that identifies its content."""
 
     version: str
     content: Any
 
 
 class Maker:
-    """Makes words and pictures of units, each once for all browsers.
+    """Makes texts and figures of units, each once for all browsers.
 
     Parameters
     ----------
     shown : Shown
     zone : tzinfo, optional
-        Times are told in it; in UTC without.
+        Time zone of the times; UTC by default.
     """
 
     def __init__(self, shown: Shown, zone: tzinfo | None = None) -> None:
@@ -298,7 +298,7 @@ class Maker:
 
     @property
     def generation(self) -> str:
-        """Return what changes when a browser has to load the page anew: units, or this process."""
+        """Return an identifier of units and process; if it changes, browsers reload the page."""
         return _digest(self._boot, *(unit.key for unit in self.shown.units))
 
     def parts(self, unit: Snapshot) -> dict[str, Made]:
@@ -315,7 +315,7 @@ class Maker:
         }
 
     def _once(self, unit: Snapshot, what: str, of: object, make: Callable[[], Any]) -> Made:
-        """Return what was made of the same; two threads may both make it, and make the same."""
+        """Return the cached result for the same input; two threads may compute it twice."""
         before = self._kept.get((unit.key, what))
         if before is not None and before[0] == of:
             return before[1]
@@ -344,7 +344,7 @@ def _versions(told: Mapping[str, Any]) -> dict[str, Made]:
 _CONFIG: Any = {
     'displaylogo': False, 'displayModeBar': 'hover', 'responsive': True,
     'plotlyServerURL': '', 'showSendToCloud': False,
-    # A list of our own: the usual one has a button that sends the data to a server.
+    # A list of our own: the default one has a button that sends the data to a server.
     'modeBarButtons': [['toImage'], ['zoom2d', 'pan2d'], ['resetScale2d']],
     'toImageButtonOptions': {'format': 'svg'},
 }  # fmt: skip
@@ -413,18 +413,18 @@ def _page(maker: Maker, may_ask: bool) -> Any:
 
 
 def _nowhere() -> Any:
-    """Return the parts of a unit that is not there: without any, Dash would not tick at all."""
+    """Return the parts of a dummy unit: without any part, Dash would not tick at all."""
     parts = [_part(-1, name) for name in PARTS]
     return html.Div([*parts, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
 
 
 class Asking:
-    """Lets a browser with the token ask a monitor for something.
+    """Lets a browser with the token send requests to a monitor.
 
     Parameters
     ----------
     token : str
-        What a browser has to know; not empty.
+        The secret token of authorised browsers; not empty.
     ask : callable
         Takes the key of a unit and one of `ASKED`; returns success and a sentence.
     """
@@ -457,7 +457,7 @@ class Asking:
 
 
 def _bytes(token: str) -> bytes:
-    # A browser may send what is no text.
+    # A browser may send values that are not strings.
     return token.encode(errors='backslashreplace')
 
 
@@ -469,11 +469,11 @@ def make_app(
     Parameters
     ----------
     shown : Shown
-        What is shown; replaced by another thread.
+        The displayed content; replaced by another thread.
     asking : Asking, optional
-        For whoever may ask a monitor for something; without it the page has no buttons.
+        Handles requests to a monitor; without it the page has no buttons.
     zone : tzinfo, optional
-        Times are told in it; in UTC without.
+        Time zone of the times; UTC by default.
     """
     maker = Maker(shown, zone)
     script = read_text('colours.js') + _file('page.js')
@@ -516,7 +516,7 @@ def _index(script: str) -> str:
 
 
 def _update(app: Dash, maker: Maker) -> None:
-    """Bring what a browser shows up to date, tick by tick."""
+    """Update the content in a browser at each tick."""
     everything = (*PARTS, 'pictures')
 
     @app.callback(  # type: ignore[untyped-decorator]
@@ -560,7 +560,7 @@ def _update(app: Dash, maker: Maker) -> None:
 
 
 def _answer(app: Dash, shown: Shown, asking: Asking) -> None:
-    """Hand what was asked on, and show the answer beside the button."""
+    """Forward a request to the monitor, and show the answer next to the button."""
 
     @app.callback(  # type: ignore[untyped-decorator]
         Output({'unit': ALL, 'part': 'answer'}, 'children'),

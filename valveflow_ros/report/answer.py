@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The answer in words and tables: the curve, its number of pieces, its dynamics."""
+"""The result in words and tables: the curve, its number of pieces, its dynamics."""
 
 from __future__ import annotations
 
@@ -41,25 +41,25 @@ from valveflow_ros.report.words import (
 )
 from valveflow_ros.signals.static_form import OPENING
 
-# A power that the valve explains less of is governed by something else, or a signal is wrong.
+# Below this explained fraction of the power, it depends on something else, or a signal is wrong.
 _LITTLE = 0.8
-_FLAT = 0.2  # a piece this much flatter than the steepest is said to answer hardly at all
+_FLAT = 0.2  # slope relative to the steepest piece, below which a piece is reported as flat
 
 
 def explained(data: Identified) -> float:
-    """Return the share of the power's variance in special segments that the curve explains."""
+    """Return the fraction of the power variance in special segments that the curve explains."""
     rows = data.special
     if not len(rows):
         return math.nan
     power = data.power[rows]
-    # Outside the identified range the outer pieces are taken to go on.
+    # Outside the identified range the outer pieces are extrapolated.
     rest = power - data.static_mw[rows]
     total = float(np.var(power))
     return 1.0 - float(np.mean(rest**2)) / total if total > 0.0 else math.nan
 
 
 def doubt(data: Identified) -> str:
-    """Return a warning where the curve is none, or wrong; empty otherwise."""
+    """Return a warning if the curve is unreliable; empty otherwise."""
     share, misfit = explained(data), data.misfit
     if share < _LITTLE:
         return (
@@ -78,7 +78,7 @@ def doubt(data: Identified) -> str:
 
 
 def misfit_words(misfit: Misfit) -> str:
-    """Say by how much a curve is wrong again and again, and where most."""
+    """Return the size of a systematic error of the curve and where it is largest, in words."""
     opening, pressure, most = misfit.worst
     return (
         f'{plain(misfit.rms_mw, 2)} MW (root mean square) at the openings and pressures of these '
@@ -88,7 +88,7 @@ def misfit_words(misfit: Misfit) -> str:
 
 
 def form_words(c: Characteristic) -> str:
-    """Say which form the power has and how that is known; nothing of the paper's, where told."""
+    """Return the form of the power and its evidence; empty for the paper's form if confirmed."""
     form = c.form
     if form is None or form.contradicted:
         return ''
@@ -110,7 +110,7 @@ def form_words(c: Characteristic) -> str:
 
 
 def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
-    """Return MW per % of opening on a piece as shown, and the pressure in MPa it holds at.
+    """Return MW per % of opening on a piece as shown, and the pressure in MPa for that value.
 
     The pressure is the median over the special samples on the piece.
     """
@@ -127,7 +127,7 @@ def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
 
 
 def answer_words(data: Identified) -> str:
-    """Return the paragraph an engineer would tell a colleague, and what endangers it."""
+    """Return a summary paragraph for an engineer, with the risks of the result."""
     c = data.shown
     ends, values, m = c.breakpoints, c.values(), c.pressure_exponent
     words = (
@@ -162,7 +162,7 @@ def answer_words(data: Identified) -> str:
 
 
 def _bends(c: Characteristic) -> str:
-    """Say what the shape means for control."""
+    """Return what the shape of the curve means for control."""
     u, per = input_name(c.pressure_exponent), per_input(c.pressure_exponent)
     if len(c.pieces) == 1:
         return f' It is straight: {plain(c.pieces[0].slope)} {per} everywhere.'
@@ -181,7 +181,7 @@ def _bends(c: Characteristic) -> str:
 
 
 def pieces_table(data: Identified) -> str:
-    """Return one row a piece."""
+    """Return a table with one row per piece."""
     c = data.shown
     m, u = c.pressure_exponent, input_name(c.pressure_exponent)
     rows = []
@@ -204,7 +204,7 @@ def pieces_table(data: Identified) -> str:
 
 
 def _rests(c: Characteristic, k: int) -> list[str]:
-    """Return what a piece rests on, as a cell of the table; none where it is not known."""
+    """Return the data behind a piece, as a cell of the table; empty list if unknown."""
     if not c.support:
         return []
     found = c.support[k]
@@ -216,7 +216,7 @@ def _rests(c: Characteristic, k: int) -> list[str]:
 
 
 def breakpoints_table(c: Characteristic) -> str:
-    """Return one row a breakpoint between pieces; empty for a straight curve."""
+    """Return a table with one row per breakpoint; empty for a straight curve."""
     if len(c.pieces) < 2:
         return ''
     rows = [
@@ -231,7 +231,7 @@ def breakpoints_table(c: Characteristic) -> str:
 
 
 def temperature_words(c: Characteristic) -> str:
-    """Return what is known of the temperature during the special segments."""
+    """Return the temperature during the special segments in words."""
     source = c.source
     if not math.isfinite(source.temperature_spread_k):
         return 'The main steam temperature is not known.'
@@ -254,7 +254,7 @@ _LOOKS = (('chosen', 'solid'), ('steady', 'dash'), ('slope', 'dot'))
 
 
 def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
-    """Return time constant and delay by region of power; what its error exceeds is not known."""
+    """Return time constant and delay by region of power; 'not known' if below its error."""
     rows = [
         [
             f'{span(d.power_from, d.power_to)} MW',
@@ -273,15 +273,15 @@ def _told(region: RegionDynamics) -> bool:
 
 
 def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
-    """Return how the power follows a sudden step of the steam flow in each region.
+    """Return the response of the power to a step of the steam flow in each region.
 
-    None where no time constant is known.
+    None if no time constant is known.
     """
     dynamics = tuple(d for d in dynamics if _told(d))
     if not dynamics:
         return None
     ends = [d.delay_s + 4.0 * d.time_constant_s for d in dynamics]
-    # One slow region must not press the others against the edge.
+    # A slow region must not compress the others at the edge of the axis.
     t = np.linspace(0.0, min(max(ends), 8.0 * min(ends)), 160)
     traces = []
     for k, d in enumerate(dynamics):
@@ -300,15 +300,15 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
     return Figure('dynamics', caption, 'Step responses by range of power.', traces, layout, 320)
 
 
-# Why so many pieces: cost and turning angle against their number (the paper's Fig. 6).
+# Choice of the number of pieces: cost and turning angle over the number (Fig. 6 of the paper).
 
 _KEPT = {
     'prediction_error': 'the number kept is the one that predicts all samples best once the '
     'dynamics are known',
 }
-_LEAST_SHOWN = 0.005  # probability of a number of pieces worth a row
+_LEAST_SHOWN = 0.005  # smaller probabilities of a number of pieces are not listed
 _DOUBTFUL = 0.05  # probability of another number of pieces that makes the chosen one uncertain
-# Mantissas of the ticks, the coarsest first.
+# Mantissas of the ticks, from coarse to fine.
 _STEPS = (
     [1.0, 2.0, 5.0],
     [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0],
@@ -317,7 +317,7 @@ _STEPS = (
 
 
 def choice_figure(choice: Choice, chosen: int) -> Figure:
-    """Return Omega(J) on a log axis above Lambda(J), and the confidence where there is one."""
+    """Return Omega(J) on a log axis above Lambda(J), with the confidence if there is one."""
 
     def colours(numbers: list[int]) -> list[str]:
         return [token('chosen' if k == chosen else 'data') for k in numbers]
@@ -380,7 +380,7 @@ def _choice_caption(choice: Choice, chosen: int) -> str:
 
 
 def _ticks(costs: FloatArray) -> Spec:
-    """Return round ticks for a logarithmic axis, at least three where there is room."""
+    """Return round ticks for a logarithmic axis, at least three if possible."""
     costs = costs[costs > 0.0]
     if not len(costs):
         return {}
@@ -405,7 +405,7 @@ def _power(value: float) -> str:
 
 
 def confidence_table(choice: Choice) -> str:
-    """Return how probable each number of pieces is; empty where the rule has no confidence."""
+    """Return the probability of each number of pieces; empty if the rule gives none."""
     likely = {j: p for j, p in sorted(choice.confidence.items()) if p >= _LEAST_SHOWN}
     if not likely:
         return ''

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a comparison: what came out first, then the evidence."""
+"""The report of a comparison: the result first, then the evidence."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ from valveflow_ros.report.page import (
 from valveflow_ros.report.words import counted, duration, input_axis, p_value, period, plain
 from valveflow_ros.segments.window import WindowContents
 
-# What came out of a comparison, in sentences.
+# The result of a comparison, in sentences.
 
 _FINDING = {
     Finding.CONFIRMED: 'In this run that comes out.',
@@ -70,7 +70,7 @@ _TERMS = {
     Terms.DYNAMIC: 'Simulation against simulation, in all special segments,',
     Terms.ALL_ROWS: 'Simulation against simulation, over all rows,',
 }
-# In a headline: what a method does, on the most that was judged first; and how the two stand.
+# For the headline: what a method does, on the largest data set first; and the ranking.
 _ABOUT = {
     Terms.ALL_ROWS: 'simulates the power of all rows',
     Terms.DYNAMIC: 'simulates the power of special segments',
@@ -88,7 +88,7 @@ _TESTED = {
 
 
 def data_words(data: Compared) -> str:
-    """Say what was learnt from and judged on."""
+    """Return which data were used for fitting and for testing."""
     if data.held_out:
         return (
             f'Learnt from the first two thirds of {data.source}, judged on its last third, which '
@@ -98,7 +98,7 @@ def data_words(data: Compared) -> str:
 
 
 def finding_words(data: Compared) -> list[str]:
-    """Return what the run says of the paper's finding, and what holds on equal terms."""
+    """Return the result for the finding of the paper, and the result on equal terms."""
     r, j = data.result, data.result.judgement
     told = [_headline(r.pairs)] if r.pairs else []
     for terms, words in _TERMS.items():
@@ -135,7 +135,7 @@ def _of(terms: Terms, pairs: tuple[Pair, ...]) -> list[Pair]:
 
 
 def _headline(pairs: tuple[Pair, ...]) -> str:
-    """Say who predicts better, like against like, on the most that was judged."""
+    """Return who predicts better, on equal terms and on the largest data set."""
     terms = next(t for t in _ABOUT if _of(t, pairs))
     parts = [
         f'{words} {" and ".join(names)}'
@@ -146,7 +146,7 @@ def _headline(pairs: tuple[Pair, ...]) -> str:
 
 
 def _against(pairs: list[Pair]) -> str:
-    """Say what each of the others has, and what the test over segments says of it."""
+    """Return the error of each other method, and the result of the test over segments."""
     told = []
     for p in pairs:
         mse = p.mse_theirs_mw2
@@ -159,7 +159,7 @@ def _against(pairs: list[Pair]) -> str:
             continue
         what = 'half hour' if p.terms is Terms.ALL_ROWS else 'segment'
         said += f', and gives no finite answer in {p.failed} of {counted(p.judged, what)}'
-        # What is left without the failures is told where it says something of its own.
+        # The result without failures is reported if it differs.
         told.append(f'{said} (over the others {tested})' if p.test.zero_is_rejected() else said)
     return ' and '.join(told) + '.'
 
@@ -191,7 +191,7 @@ def _truth_words(data: Compared) -> str:
 
 
 def comparison_page(data: Compared) -> Page:
-    """Return the report: what came out and the curves first, then the evidence."""
+    """Return the report: the result and the curves first, then the evidence."""
     c = data.result.characteristic
     first, *rest = finding_words(data)
     spans = [period(part.time_ns[0], part.time_ns[-1]) for part in (data.learnt, data.judged)]
@@ -228,7 +228,7 @@ def comparison_page(data: Compared) -> Page:
 
 
 def _linear_block_words(data: Compared) -> str:
-    """Say what linear block the Hammerstein model has."""
+    """Return the linear block of the Hammerstein model in words."""
     m = data.result.hammerstein.model
     times = ', '.join(f'{plain(float(t), 3)} s' for t in m.time_constants_s)
     return (
@@ -243,7 +243,7 @@ def _order(taps: int, poles: int) -> str:
 
 
 def _tuning(data: Compared) -> Section:
-    """Return what each baseline was chosen from; one that was not tuned proves nothing."""
+    """Return the candidates for each baseline; a baseline without tuning is no fair comparison."""
     h, s = data.result.hammerstein, data.result.sparse
     rows = [
         [f'Hammerstein, {_order(n_b, n_f)}', text(noise), plain(mse)]
@@ -282,7 +282,7 @@ def _tuning(data: Compared) -> Section:
 # Figs. 7 and 11 of the paper: the curves.
 
 _DOTS = 5000
-# Colour, dash and width of each method's line, everywhere on the page.
+# Colour, dash and width of the line of each method, the same in all figures.
 LOOK = {
     'paper': ('raw', 'dash', 1.6),
     'proposed': ('curve', 'solid', 2.4),
@@ -292,16 +292,16 @@ LOOK = {
 
 
 def _method_line(method: str, x: Any, y: Any, hover: str, **more: Any) -> Spec:
-    """Return a line in the look that all lines of a method have."""
+    """Return a line in the style of a method."""
     colour, dash, width = LOOK[method]
-    # In a legend there is little room.
+    # A legend has little space.
     name = "the paper's curve" if method == 'paper' else LABELS[method]
     shared = {'legendgroup': method, 'showlegend': True, 'yaxis': 'y', **more}
     return line(x, y, name, colour, hover, dash=dash, width=width, **shared)
 
 
 def _cloud(contents: WindowContents, special: bool) -> Spec:
-    """Return some of the measured points, of special segments or of all rows."""
+    """Return a subset of the measured points, of special segments or of all rows."""
     rows = contents.special_rows() if special else np.arange(len(contents.u))
     rows = rows[np.isfinite(contents.u[rows]) & np.isfinite(contents.power_mw[rows])]
     if len(rows) > _DOTS:
@@ -326,7 +326,7 @@ def _curves(data: Compared) -> list[Spec]:
 
 
 def curves_figure(data: Compared) -> Figure:
-    """Return the curves over the special samples they are judged by (Fig. 7)."""
+    """Return the curves over the special samples of the test data (Fig. 7)."""
     layout = {
         'xaxis': axis(input_axis(data.result.characteristic.pressure_exponent)),
         'yaxis': axis('generated power (MW)'), 'showlegend': True,
@@ -341,7 +341,7 @@ def curves_figure(data: Compared) -> Figure:
 
 
 def truth_figure(data: Compared) -> Figure:
-    """Return the curves over all samples, and how far each is from the true one (Fig. 11)."""
+    """Return the curves over all samples, and their errors relative to the true one (Fig. 11)."""
     curves = curves_of(data)
     u = rounded(curves['u'], 6)
     traces = [_cloud(data.learnt, special=False), *_curves(data)]
@@ -363,7 +363,7 @@ def truth_figure(data: Compared) -> Figure:
     return Figure('truth', caption, words, traces, layout, height=620)
 
 
-# Figs. 9 and 10 of the paper: stretches of the data to judge by, measured and simulated.
+# Figs. 9 and 10 of the paper: parts of the test data, measured and simulated.
 
 _LENGTH_S = 7200.0
 _MOVE_S = 900.0
@@ -373,7 +373,7 @@ _COLOUR = {SegmentKind.STEADY: 'steady', SegmentKind.SLOPE: 'slope'}
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Rows [first, end) to be shown, and the segments within."""
+    """Rows [first, end) to be shown, and the segments in them."""
 
     name: str
     first: int
@@ -382,7 +382,7 @@ class Stretch:
 
 
 def stretches(data: Compared) -> list[Stretch]:
-    """Return two hours at low and two at high power, those with most special segments."""
+    """Return two hours at low and two at high power, with most kinds and numbers of segments."""
     trial, segments = data.result.trial, data.result.judgement.segments
     rows = round(_LENGTH_S / trial.step_s)
     middle = float(np.median([s.power_mw for s in segments]))
@@ -403,7 +403,7 @@ def stretches(data: Compared) -> list[Stretch]:
 
 
 def _means(values: FloatArray, first: int, end: int) -> FloatArray:
-    """Return means over short blocks, so that lines stay readable."""
+    """Return means over short blocks, to limit the number of points."""
     block = max(1, (end - first) // _POINTS)
     usable = (end - first) // block * block
     with np.errstate(invalid='ignore'):
@@ -413,7 +413,7 @@ def _means(values: FloatArray, first: int, end: int) -> FloatArray:
 def _over_time(
     data: Compared, values: FloatArray, first: int, end: int
 ) -> tuple[list[float | None], list[float | None], str]:
-    """Return times, means of a power and the hover text of a line of both."""
+    """Return times, means of a power, and the hover text for both."""
     at = rounded(_means(data.result.trial.time_ns[first:end] / 1e6, 0, end - first), 14)
     known = np.where(np.isfinite(values), values, np.nan)
     return at, rounded(_means(known, first, end)), '%{x|%d %b %H:%M:%S}<br>%{y:.1f} MW'
@@ -442,7 +442,7 @@ def stretch_figure(data: Compared, stretch: Stretch) -> Figure:
         for name in names if name in data.result.predictions
     ]  # fmt: skip
     layout = {
-        # Labels that may turn and turn back would never let the margins rest.
+        # Tick labels that rotate automatically would make the margins unstable.
         'xaxis': time_axis(anchor='y2', tickangle=0, nticks=8),
         'yaxis': axis('power (MW)', domain=[0.53, 1.0]),
         'yaxis2': axis('power (MW)', domain=[0.0, 0.47], matches='y'),
@@ -463,7 +463,7 @@ def stretch_figure(data: Compared, stretch: Stretch) -> Figure:
 
 
 def _fastest(data: Compared, low: bool) -> tuple[int, int] | None:
-    """Return rows around the flow's largest move in five minutes, at low or at high power."""
+    """Return rows around the largest change of the flow in five minutes, at low or high power."""
     trial = data.result.trial
     flow = np.where(trial.good, data.result.predictions['proposed.static'], np.nan)
     rows = max(1, round(300.0 / trial.step_s))
@@ -481,7 +481,7 @@ def _fastest(data: Compared, low: bool) -> tuple[int, int] | None:
 
 
 def moves_figure(data: Compared) -> Figure | None:
-    """Return how the power follows the flow at low and at high power (Fig. 10)."""
+    """Return the response of the power to the flow at low and at high power (Fig. 10)."""
     traces: list[Spec] = []
     layout: Spec = {'showlegend': True}
     for side, load, domain in (('', 'low', [0.0, 0.44]), ('2', 'high', [0.56, 1.0])):

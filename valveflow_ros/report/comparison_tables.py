@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of a comparison, for people and as CSV: II, III and IV of the paper."""
+"""The tables of a comparison, as HTML and CSV: Tables II, III and IV of the paper."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from valveflow_ros.report.page import paragraph, table, text
 from valveflow_ros.report.words import decimals, interval, moment, p_value, plain, span
 from valveflow_ros.segments.window import WindowContents
 
-# In the order in which they are told; the names of the numbers, and those for people.
+# In the order of the tables; the names in files, and those for people.
 METHODS = ('paper', 'proposed', 'hammerstein', 'sparse')
 LABELS = {
     'paper': "the paper's curve of special segments",
@@ -54,14 +54,14 @@ _PLACES = 500
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A comparison and the data it came from.
+    """A comparison and its data.
 
     Attributes
     ----------
     source, other : str
-        Names of the logs: learnt from, and judged on.
+        Names of the logs for fitting and for testing.
     held_out : bool
-        Both are the same log, cut in two.
+        True if both are parts of one log.
     result : Comparison
     learnt, judged : WindowContents
     notes : tuple of str
@@ -78,17 +78,17 @@ class Compared:
 
     @property
     def predictions(self) -> tuple[str, ...]:
-        """Return the names of the predictions that there are, in the order of the tables."""
+        """Return the names of the available predictions, in the order of the tables."""
         return tuple(name for name in PREDICTIONS if name in self.result.predictions)
 
 
 def mse_cell(value: float) -> str:
-    """Write a mean squared error: endless where an answer ran away, a dash where there is none."""
+    """Return a mean squared error as text: '∞' if the prediction diverged, '–' if missing."""
     return plain(value) if math.isfinite(value) else '∞' if math.isinf(value) else '–'
 
 
 def _pieces(data: Compared) -> Iterator[tuple[str, int, Line]]:
-    """Yield each piece of each curve that has pieces: its method, its number, the curve."""
+    """Yield each piece of each curve with pieces: method, index of the piece, curve."""
     for method in METHODS:
         if (line := data.result.lines.get(method)) is not None:
             for j in range(len(line.slopes)):
@@ -110,7 +110,7 @@ def parameters_table(data: Compared) -> str:
 
 
 def errors_table(data: Compared) -> str:
-    """Return Table IV: parameters against the true ones; empty if there is no truth."""
+    """Return Table IV: parameters and true ones; empty if the true curve is unknown."""
     truth = data.result.truth
     if truth is None:
         return ''
@@ -144,7 +144,7 @@ def errors_table(data: Compared) -> str:
 
 
 def totals_table(data: Compared) -> str:
-    """Return the mean squared errors over all segments, and how often zero mean stands."""
+    """Return the mean squared errors over all segments, and the tests for zero mean."""
     j, all_rows = data.result.judgement, data.result.all_rows
     rows = []
     for name in data.predictions:
@@ -166,12 +166,12 @@ def totals_table(data: Compared) -> str:
 
 
 def pairs_table(pairs: Sequence[Pair]) -> str:
-    """Return who is better than whom, on which terms."""
+    """Return which method is better, and on which terms."""
     rows = []
     for p in sorted(pairs, key=lambda p: list(_TERMS).index(p.terms)):
         tested = p_value(p.test.p_value)
         if p.failed:
-            # What the verdict rests on: not on the test alone.
+            # The verdict is based on these failures, not only on the test.
             told = f'theirs has no finite answer in {p.failed} of {p.judged}'
             tested = f'{told}; the others: {tested}'
         rows.append([
@@ -218,7 +218,7 @@ def segments_table(data: Compared, segments: Sequence[JudgedSegment]) -> str:
 
 
 def segments_csv(judgement: Judgement, names: Sequence[str]) -> str:
-    """Return one row a special segment (Table III), unrounded."""
+    """Return one row per special segment (Table III), unrounded."""
     columns = ('mse_mw2', 'mean_mw', 't', 'p', 'samples_effective', 't_effective', 'p_effective')
     head = ['segment', 'kind', 'start_ns', 'end_ns', 'samples', 'power_mw']
     head += [f'{name}.{column}' for name in names for column in columns]
@@ -236,7 +236,7 @@ def segments_csv(judgement: Judgement, names: Sequence[str]) -> str:
 
 
 def parameters_csv(data: Compared) -> str:
-    """Return one row a piece (Table II, and IV where the truth is known), unrounded."""
+    """Return one row per piece (Table II, and IV if the true curve is known), unrounded."""
     truth = data.result.truth
     rows = []
     for method, j, line in _pieces(data):
@@ -258,7 +258,7 @@ def curves_csv(data: Compared) -> str:
 
 
 def curves_of(data: Compared) -> Mapping[str, FloatArray]:
-    """Return u and each method's curve there, MW; NaN where a method says nothing."""
+    """Return u and the curve of each method there, MW; NaN where a method has none."""
     r = data.result
     ends = r.characteristic.breakpoints
     u = np.linspace(float(ends[0]), float(ends[-1]), _PLACES)

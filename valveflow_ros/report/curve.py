@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The curve over the samples it was found in, with its error; what it leaves; its reference."""
+"""The curve with its samples and error; its residual; its reference."""
 
 from __future__ import annotations
 
@@ -46,20 +46,20 @@ _Z95 = 1.959963984540054
 _SHADES = 5
 _COLUMNS, _ROWS = 150, 100
 _DAY_NS = 86400 * 10**9
-_LONGER = 1.5  # of a log in days, for its last day to be worth marking
-_LEAST = 3  # segments that are worth a picture
+_LONGER = 1.5  # length of a log in days, above which its last day is marked
+_LEAST = 3  # fewer segments are not drawn
 _SURE = 0.9999
 _SAME_PRESSURE = 0.02
 _OPENINGS = 121
 
 
 def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
-    """Return the standard error of one piece's line at ``u`` in MW, NaN if not known.
+    """Return the standard error of the line of a piece at ``u`` in MW, NaN if unknown.
 
     For a straight line through samples with mean m and variance s of u, the
-    error is ``slope_stderr * sqrt((u - m)^2 + s)``: smallest where the samples
-    are, and growing away from them. Taking it from the slope's error alone
-    avoids the difference of two large numbers that slope and intercept give.
+    error is ``slope_stderr * sqrt((u - m)^2 + s)``: smallest near the mean of the
+    samples, and growing away from it. Computing it from the slope's error alone
+    avoids the difference of two large numbers, slope and intercept.
     """
     inside = u_samples[(u_samples >= piece.u_from) & (u_samples <= piece.u_to)]
     if not math.isfinite(piece.slope_stderr) or len(inside) < 3:
@@ -68,7 +68,7 @@ def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
 
 
 def curve_figure(data: Identified) -> Figure:
-    """Return the picture of the characteristic."""
+    """Return the figure of the characteristic."""
     c = data.shown
     u = data.u[data.special]
     traces = [_heat(u, data.power_shown[data.special]), *_bands(data, u)]
@@ -102,7 +102,7 @@ def curve_figure(data: Identified) -> Figure:
 
 
 def opening_figure(data: Identified) -> Figure | None:
-    """Return the power against the opening at pressures the unit ran at; None without any."""
+    """Return the power over the opening at typical pressures; None if the pressure is unknown."""
     opening, pressure = (
         data.table.column(signal)[data.special]
         for signal in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
@@ -174,7 +174,7 @@ def _line(
     pieces: tuple[Piece, ...], name: str, colour: str, width: float, dash: str = '',
     hover: str = 'u %{x:.4~g}<br>%{y:.4~g} MW',
 ) -> Spec:  # fmt: skip
-    """Return the lines of all pieces, a gap between two."""
+    """Return the lines of all pieces, separated by gaps."""
     x = [v for p in pieces for v in (p.u_from, p.u_to, math.nan)]
     y = [
         v for p in pieces
@@ -187,12 +187,12 @@ def _line(
 def density(
     x: FloatArray, y: FloatArray, columns: int, rows: int
 ) -> tuple[tuple[float, float], tuple[float, float], IntArray]:
-    """Count points in a grid that spans them.
+    """Count points in a grid that covers their range.
 
     Returns
     -------
     across, up : tuple of float
-        Centre of the first cell and distance of cells.
+        Centre of the first cell and distance between cells.
     counts : int64 (rows, columns)
     """
     (x_low, x_high), (y_low, y_high) = _span(x), _span(y)
@@ -205,7 +205,7 @@ def density(
 
 
 def _span(values: FloatArray) -> tuple[float, float]:
-    """Return the ends of the values, a little apart even where all are equal."""
+    """Return the ends of the range of values, not identical even if all values are equal."""
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())
@@ -216,7 +216,7 @@ def _span(values: FloatArray) -> tuple[float, float]:
 def _heat(u: FloatArray, power: FloatArray) -> Spec:
     (x0, dx), (y0, dy), counts = density(u, power, _COLUMNS, _ROWS)
     most = max(1, int(counts.max(initial=0)))
-    # The steps of the colours follow the logarithm of the count.
+    # The colour scale is logarithmic in the count.
     places = np.linspace(0.0, 1.0, _SHADES)
     if most > 1:
         places = (most**places - 1.0) / (most - 1.0)
@@ -263,9 +263,9 @@ def _breakpoints(data: Identified) -> Spec:
 
 
 def last_range(data: Identified) -> tuple[float, float] | None:
-    """Return between which u the unit ran in the last day of the log, but for 1 % of the time.
+    """Return the central 99 % range of u in the last day of the log.
 
-    None where the log is hardly longer than that, or u is not known then.
+    None if the log is not much longer than a day, or if u is unknown in the last day.
     """
     time_ns = data.table.time_ns
     if not len(time_ns) or time_ns[-1] - time_ns[0] < _LONGER * _DAY_NS:
@@ -279,7 +279,7 @@ def last_range(data: Identified) -> tuple[float, float] | None:
 
 
 def segments_figure(data: Identified) -> Figure | None:
-    """Return the mean residual of each segment; None where there are hardly any."""
+    """Return the mean residual of each segment; None if there are too few segments."""
     c = data.characteristic
     found = segment_residuals(c, data.segments)
     if len(found) < _LEAST:
@@ -313,7 +313,7 @@ def segments_figure(data: Identified) -> Figure | None:
 
 
 def shift_section(data: Identified) -> Section | None:
-    """Return the judgement against the reference; None where there was no reference."""
+    """Return the judgement against the reference; None without a reference."""
     shift = data.shift
     if shift is None or data.reference is None:
         return None
@@ -350,7 +350,7 @@ def _row(number: int, p: PieceShift) -> list[str]:
 
 
 def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
-    """Return each segment's difference from the reference over time."""
+    """Return the difference of each segment from the reference over time."""
     moved = np.zeros(len(found), dtype=bool)
     for p in shift.pieces:
         if p.moved:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What became of every reading, and where data are missing."""
+"""How the readings were used, and where data are missing."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from valveflow_ros.report.identified import Identified
 
 
-# The aligner's reasons as a person would say them, in the order of the table.
+# The reasons of the aligner in plain words, in the order of the table.
 REASON_WORDS = {
     'not_finite': 'not a number',
     'bad_quality': 'marked bad by the sender',
@@ -60,43 +60,43 @@ REASON_WORDS = {
 _NEEDED = ('valve_opening', 'main_steam_pressure', 'generated_power')
 _BINS = 60
 _STRETCHES = 240
-_WHOLE = 0.999  # a stretch of time with fewer of its values is drawn as incomplete
+_WHOLE = 0.999  # a time interval with a smaller fraction of its values is drawn as incomplete
 _DRAWN_STRETCHES = 5000
 _SEGMENT_POINTS = 4000
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A stretch of time without any row."""
+    """A time interval without any row."""
 
     start_ns: int
     end_ns: int
 
     @property
     def seconds(self) -> float:
-        """Return its length."""
+        """Return the length."""
         return (self.end_ns - self.start_ns) / 1e9
 
 
 def gaps(time_ns: IntArray, period_ns: int, at_least: float = 1.5) -> list[Gap]:
-    """Return the stretches in which rows are missing, the longest first."""
+    """Return the intervals in which rows are missing, the longest first."""
     places = np.flatnonzero(np.diff(time_ns) > at_least * period_ns)
     found = [Gap(int(time_ns[k]), int(time_ns[k + 1])) for k in places]
     return sorted(found, key=lambda g: g.start_ns - g.end_ns)
 
 
 def rejected(counts: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
-    """Return how many readings were refused, by reason, over all signals; only what occurred."""
+    """Return the number of rejected readings by reason, over all signals; zeros are left out."""
     total = {
         reason: sum(by_reason.get(reason, 0) for by_reason in counts.values())
         for reason in REASON_WORDS
-        if reason != 'late'  # these were used after all
+        if reason != 'late'  # late readings were used
     }
     return {reason: n for reason, n in total.items() if n}
 
 
 def usable_share(table: SampleTable) -> float:
-    """Return the share of rows in which opening, pressure and power are all known."""
+    """Return the fraction of rows in which opening, pressure and power are all known."""
     if not len(table):
         return float('nan')
     needed = [i.signal for i in SIGNALS if i.topic in _NEEDED]
@@ -104,7 +104,7 @@ def usable_share(table: SampleTable) -> float:
 
 
 def quality_words(data: Identified) -> str:
-    """Return what an engineer should know about the data, as a paragraph."""
+    """Return a paragraph on the data quality for an engineer."""
     words = (
         f'{counted(len(data.table), "row")} of {duration(data.period_ns / 1e9)}; opening, '
         f'pressure and power are all known in {percent(usable_share(data.table))} of them. '
@@ -123,7 +123,7 @@ def quality_words(data: Identified) -> str:
 
 
 def quality_table(data: Identified) -> str:
-    """Return readings, rejections and ranges, one row a signal that was sent."""
+    """Return readings, rejections and ranges, one row per signal in the data."""
     occurred = {r for by_reason in data.counts.values() for r, n in by_reason.items() if n > 0}
     reasons = [r for r in REASON_WORDS if r in occurred]
     sent = [i for i in SIGNALS if i.required or any(data.counts.get(i.topic, {}).values())]
@@ -151,7 +151,7 @@ def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
 
 
 def coverage_figure(data: Identified) -> Figure | None:
-    """Return how long the unit ran at each u, and how much of it could be used."""
+    """Return the operating time at each u, and how much of it was usable."""
     known = data.u[np.isfinite(data.u) & np.isfinite(data.power)]
     if not len(known):
         return None
@@ -196,7 +196,7 @@ def _sent(data: Identified) -> list[SignalInfo]:
 
 
 def presence(data: Identified) -> tuple[FloatArray, FloatArray]:
-    """Return the share of expected rows that have a value, by signal and stretch of time.
+    """Return the fraction of expected rows that have a value, by signal and time interval.
 
     Returns
     -------
@@ -217,7 +217,7 @@ def presence(data: Identified) -> tuple[FloatArray, FloatArray]:
 
 
 def presence_figure(data: Identified) -> Figure | None:
-    """Return when values are missing; None where none is."""
+    """Return when values are missing; None if none are missing."""
     if len(data.table) < 2:
         return None
     edges, share = presence(data)
@@ -246,7 +246,7 @@ def presence_figure(data: Identified) -> Figure | None:
     return Figure('presence', caption, words, traces, layout, height=110 + 34 * len(names))
 
 
-# The signals over time, with the special segments found in them.
+# The signals over time, with their special segments.
 
 _KINDS = (
     (SegmentKind.STEADY, 'steady state', 'steady'),
@@ -255,11 +255,11 @@ _KINDS = (
 
 
 def signals_figure(data: Identified) -> Figure:
-    """Return u and power over time (the paper's Fig. 5)."""
+    """Return u and power over time (Fig. 5 of the paper)."""
     unit = input_unit(data.characteristic.pressure_exponent)
     time_ns = data.table.time_ns
     days = (int(time_ns[-1]) - int(time_ns[0])) / 86400e9 if len(time_ns) else 0.0
-    # Buttons for the last hours or days, where the log is longer.
+    # Buttons for the last hours or days, if the log is longer.
     steps: list[Spec] = []
     if days > 0.5:
         steps.append({'step': 'hour', 'count': 6, 'label': 'last 6 h', 'stepmode': 'backward'})
@@ -322,16 +322,16 @@ def _panel(data: Identified, values: FloatArray, up: str, unit: str) -> list[Spe
 def envelope(
     time_ns: IntArray, values: FloatArray, stretches: int, period_ns: int
 ) -> tuple[int, float, FloatArray]:
-    """Reduce a signal to at most ``2 * stretches`` points that keep every peak.
+    """Reduce a signal to at most ``2 * stretches`` points, keeping every peak.
 
-    A short signal comes back with each of its values on its own grid place.
+    A short signal keeps each of its values at its own grid position.
 
     Returns
     -------
     start_ns, step_ns : int, float
-        Time of the first point and from one point to the next.
+        Time of the first point and step between points.
     values : float64 (2 k,)
-        Lowest and highest value of each stretch in the order in which they occur; NaN where
+        Lowest and highest value of each interval in the order in which they occur; NaN if
         nothing was measured.
     """
     if not len(time_ns):
@@ -361,9 +361,9 @@ def segment_path(
     Parameters
     ----------
     rows : int64 (k, 2)
-        First and end row of each segment.
+        First and end row (exclusive) of each segment.
     points : int
-        About how many points all segments together may have.
+        Approximate maximum number of points of all segments together.
     """
     total = int((rows[:, 1] - rows[:, 0]).sum()) if len(rows) else 0
     block = max(1, -(-total // max(1, points)))

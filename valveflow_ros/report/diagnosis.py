@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a diagnosis: what is wrong, why, the extended model, the proof."""
+"""The report of a diagnosis: errors, causes, the extended model, the evidence."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _HOW = (
 
 @dataclass(frozen=True, slots=True)
 class Diagnosed:
-    """What the page is made from."""
+    """The data of the page."""
 
     source: str
     start_ns: int
@@ -76,7 +76,7 @@ class Diagnosed:
 
 
 def diagnosis_page(data: Diagnosed) -> Page:
-    """Return the report: the answer and its picture first, then the four steps."""
+    """Return the report: the result and its figure first, then the four steps."""
     agree = 'Simulation and measurement agree'
     if _drifts(data.diagnosis):
         agree = 'No cause found, but the power drifts'
@@ -97,12 +97,12 @@ def diagnosis_page(data: Diagnosed) -> Page:
 
 
 def _drifts(d: Diagnosis) -> bool:
-    """Tell whether the power drifts over hours and days, which is no agreement."""
+    """Return True if the power drifts over hours and days, so that the model does not agree."""
     return d.disturbance is not None and d.disturbance.drift_mw is not None
 
 
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
-    """Return the verdict with its doubts, what it is worth, and the one telling picture."""
+    """Return the verdict with its uncertainty, its effect, and the most informative figure."""
     d = data.diagnosis
     said = text(d.sentence)
     good = d.verdict == NOTHING and not _drifts(d)
@@ -227,10 +227,10 @@ def _proof(data: Diagnosed) -> Section:
     return Section('4. The proof', parts)
 
 
-# How a diagnosis is put for people: its variables, its parameters, times as dates.
+# Presentation of a diagnosis: names of variables, parameters, times as dates.
 
-# What the residual is drawn against: in a sentence, at an axis, at a narrow one, and what a
-# line that leaves the band there points to.
+# For each variable: its name in a sentence, its axis title, a short axis title, and the likely
+# cause if the line leaves the band.
 _VARIABLES = {
     'u': (
         'the integrated input u', 'integrated input u ({unit})', '',
@@ -267,12 +267,12 @@ _MOST_SPANS = 20
 
 
 def _variable(name: str) -> str:
-    """Return a variable as it stands in a sentence."""
+    """Return the name of a variable in a sentence."""
     return _VARIABLES[name][0] if name in _VARIABLES else name
 
 
 def axis_titles(name: str, exponent: float) -> dict[str, str]:
-    """Return what stands at an axis, and at a narrow one, as HTML; the exponent is that of u."""
+    """Return the title of an axis and a short one, as HTML; the exponent is that of u."""
     if name not in _VARIABLES:
         return {'text': name}
     _, long, short, _ = _VARIABLES[name]
@@ -281,12 +281,12 @@ def axis_titles(name: str, exponent: float) -> dict[str, str]:
 
 
 def points_to(name: str) -> str:
-    """Return what a line that leaves the band points to; '' where nothing is known."""
+    """Return the likely cause if the line leaves the band; '' if unknown."""
     return _VARIABLES[name][3] if name in _VARIABLES else ''
 
 
 def cells(estimate: Estimate, exponent: float) -> tuple[str, str]:
-    """Return a parameter with its unit, and its 95 % interval; a time and its own as dates."""
+    """Return a parameter with its unit, and its 95 % interval; times are given as dates."""
     if estimate.origin_ns is not None:
         at, between = dates(estimate)
         return at, between or UNKNOWN
@@ -296,14 +296,14 @@ def cells(estimate: Estimate, exponent: float) -> tuple[str, str]:
 
 
 def times_in_effect(switches_s: Sequence[float], start_ns: int, end_ns: int) -> str:
-    """Return when a cause was in effect that is switched in and out, as dates.
+    """Return the dates when a cause that is switched on and off was in effect.
 
     Parameters
     ----------
     switches_s : sequence of float
-        In, out, in, ...: seconds after the first row.
+        On, off, on, ...: seconds after the first row.
     start_ns, end_ns : int
-        First and last row.
+        Times of the first and last row.
     """
     moments = [told(start_ns, s) for s in switches_s]
     if len(moments) % 2:
@@ -318,7 +318,7 @@ _BOTH = (('simulation', 'raw', 'dash'), ('extended model', 'curve', 'solid'))
 
 
 def _moments(start_ns: int, time_s: FloatArray) -> list[float | None]:
-    """Return times since the first row as a date axis wants them."""
+    """Return times since the first row in the format of a date axis."""
     return moments(start_ns / 1e6 + 1e3 * np.asarray(time_s))
 
 
@@ -331,9 +331,9 @@ def _marked(
 
 
 def signature_figure(s: Signature, data: Diagnosed, how: str = '') -> Figure:
-    """Return the mean residual against one variable, before and after extending.
+    """Return the mean residual over one variable, of the simulation and the extended model.
 
-    ``how`` says how such a picture is read.
+    ``how`` explains how to read such a figure.
     """
     titles = axis_titles(s.variable, data.exponent)
     across, x = axis(titles), rounded(s.middle, 6)
@@ -364,7 +364,7 @@ def signature_figure(s: Signature, data: Diagnosed, how: str = '') -> Figure:
 
 
 def answer_figure(answers: Sequence[Answer]) -> Figure:
-    """Return the mean residual around fast moves, opening and closing apart."""
+    """Return the mean residual around fast moves, separately for opening and closing."""
     traces = []
     for a in answers:
         way = 'opening' if a.up else 'closing'
@@ -387,7 +387,7 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
 
 
 def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
-    """Return the error in every special segment of the sealed blocks, before and after."""
+    """Return the error in every special segment of the sealed (test) blocks, for both models."""
     better = sum(s.rmse_after < s.rmse_before for s in segments)
     at = moments([s.start_ns / 1e6 for s in segments])
     errors = [s.rmse_before for s in segments], [s.rmse_after for s in segments]
@@ -408,7 +408,7 @@ def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
 
 
 def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
-    """Return where the simulation is wrong over two variables, and where the extended model is."""
+    """Return the errors of the simulation and of the extended model over two variables."""
     across, over = rounded(m.across_edges, 6), Spec()
     below = axis_titles(m.across, data.exponent)['text']
     if m.across == 'time':
@@ -434,7 +434,7 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
         'xaxis': {**over, 'domain': [0.0, 0.46]},
         'xaxis2': {**over, 'domain': [0.54, 1.0], 'anchor': 'y2'},
         'yaxis': axis(axis_titles(m.up, data.exponent)['text']),
-        # One title for both axes: side by side there is no room for two on a telephone.
+        # One title for both axes: two titles side by side do not fit on a phone.
         'annotations': [
             {'text': below, 'showarrow': False, 'xref': 'paper', 'x': 0.5, 'xanchor': 'center',
              'yref': 'paper', 'y': 0.0, 'yshift': -56}

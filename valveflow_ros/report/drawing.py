@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the report as PNG and SVG files, drawn by matplotlib from the same data."""
+"""Figures of the report as PNG and SVG files, drawn by matplotlib from the same data."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from valveflow_ros.report.figure import Figure, Spec, axis_of, column, is_date, 
 from valveflow_ros.report.page import read_text
 
 FORMATS = ('png', 'svg')
-_WIDTH, _INCH = 9.6, 96.0  # of a picture in inches; the page's pixels in an inch
+_WIDTH, _INCH = 9.6, 96.0  # figure width in inches; page pixels per inch
 _DPI = 150
-_LONG = 26  # signs of a legend's entry; longer ones stand in two columns
+_LONG = 26  # characters of a legend entry; longer ones are set in two columns
 _DASHES = {'dash': '--', 'dot': ':', 'dashdot': '-.'}
 _SIGNS = {
     'circle': 'o', 'circle-open': 'o', 'square': 's', 'diamond': 'D', 'triangle-up': '^',
     'x': 'X', 'cross': 'P', 'star': '*', 'line-ns-open': '|',
 }  # fmt: skip
-_POINTS = 72.0 / 96.0  # of a pixel
-_MAPS = {'RdBu': 'RdBu_r'}  # plotly's runs the other way round
-_DAY_MS = 86400e3  # matplotlib counts days
+_POINTS = 72.0 / 96.0  # points per pixel
+_MAPS = {'RdBu': 'RdBu_r'}  # the colour scale of plotly has the opposite direction
+_DAY_MS = 86400e3  # matplotlib uses days
 _RGBA = re.compile(r'rgba\((\d+), (\d+), (\d+), ([\d.]+)\)')
-_NUMBERS = ('x', 'y', 'z', 'customdata', 'hovertext')  # of a trace: no colours in there
+_NUMBERS = ('x', 'y', 'z', 'customdata', 'hovertext')  # numeric entries of a trace
 
 
 def check_drawing() -> None:
-    """Refuse early where pictures cannot be drawn.
+    """Raise early if figures cannot be drawn.
 
     Raises
     ------
@@ -51,13 +51,13 @@ def check_drawing() -> None:
 
 
 def palette() -> Mapping[str, str]:
-    """Return the colours of the page's light look by name."""
+    """Return the colours of the light theme of the page by name."""
     light = read_text('style.css').split('@media', 1)[0]
     return dict(re.findall(r'--([a-z0-9-]+):\s*([^;]+);', light))
 
 
 def figure_files(figure: Figure) -> dict[str, bytes]:
-    """Return a picture as files by name: ``curve.png`` and ``curve.svg``.
+    """Return a figure as files by name: ``curve.png`` and ``curve.svg``.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def figure_files(figure: Figure) -> dict[str, bytes]:
 
     colours = palette()
     files = {}
-    # The same log gives the same files: no date, no names by chance.
+    # The same log must give identical files: no date, no random names.
     with rc_context({'svg.hashsalt': figure.name, 'font.size': 10, 'svg.fonttype': 'path'}):
         sheet = Sheet(figsize=(_WIDTH, figure.height / _INCH), layout='constrained')
         FigureCanvasAgg(sheet)
@@ -84,7 +84,7 @@ def figure_files(figure: Figure) -> dict[str, bytes]:
             told = {'Title': figure.name, 'Description': plain_text(figure.caption)}
             date = {'Date': None} if kind == 'svg' else {}
             with warnings.catch_warnings():
-                # A sign no font has is drawn as a box; that is no reason to speak.
+                # A character missing in the font is drawn as a box; no warning is needed.
                 warnings.simplefilter('ignore', UserWarning)
                 sheet.savefig(out, format=kind, dpi=_DPI, metadata={**told, **date})
             files[f'{figure.name}.{kind}'] = out.getvalue()
@@ -92,7 +92,7 @@ def figure_files(figure: Figure) -> dict[str, bytes]:
 
 
 def _painted(value: Any, colours: Mapping[str, str]) -> Any:
-    """Return plotly's data with its colours as matplotlib takes them."""
+    """Return the plotly data with colours in the format of matplotlib."""
     if isinstance(value, dict):
         return {k: v if k in _NUMBERS else _painted(v, colours) for k, v in value.items()}
     if isinstance(value, list):
@@ -107,10 +107,10 @@ def _painted(value: Any, colours: Mapping[str, str]) -> Any:
 
 
 def _fill(sheet: Any, figure: Figure, grid_colour: Any) -> None:
-    """Draw a picture whose colours are painted: a pane for each pair of axes."""
+    """Draw a figure with resolved colours: one pane per pair of axes."""
     columns, column_of = _places(figure.layout, 'x')
     rows, row_of = _places(figure.layout, 'y')
-    # The highest share of the page is the first row.
+    # The pane with the highest domain is in the first row.
     row_of = {name: len(rows) - 1 - k for name, k in row_of.items()}
     heights = [high - low for low, high in reversed(rows)]
     grid = sheet.add_gridspec(len(rows), len(columns), height_ratios=heights)
@@ -129,7 +129,7 @@ def _fill(sheet: Any, figure: Figure, grid_colour: Any) -> None:
         if figure.layout.get(f'yaxis{y[1:]}', {}).get('rangemode') == 'tozero':
             pane.set_ylim(bottom=0.0)
         if row_of.get(y, 0) < max(row_of.get(b, 0) for a, b in panes if a == x):
-            # The axis stands below the last of the panes that share it, as on the page.
+            # The axis is drawn below the last of the panes that share it, as on the page.
             pane.set_xlabel('')
             pane.tick_params(labelbottom=False)
             pane.xaxis.get_offset_text().set_visible(False)
@@ -143,7 +143,7 @@ def _fill(sheet: Any, figure: Figure, grid_colour: Any) -> None:
 
 
 def _places(layout: Spec, letter: str) -> tuple[list[tuple[float, float]], dict[str, int]]:
-    """Return the shares of the page that axes take, in their order, and which one each takes."""
+    """Return the domains of the axes in order, and the index of the domain of each axis."""
     shares = {
         key.replace('axis', ''): tuple(axis.get('domain', (0.0, 1.0)))
         for key, axis in layout.items()
@@ -154,7 +154,7 @@ def _places(layout: Spec, letter: str) -> tuple[list[tuple[float, float]], dict[
 
 
 def _prepare(pane: Any, figure: Figure, trace: Spec, grid_colour: Any) -> None:
-    """Give a pane its titles and its axes' kinds."""
+    """Set titles and axis types of a pane."""
     from matplotlib import dates, ticker
 
     across, up = axis_of(figure, trace, 'x'), axis_of(figure, trace, 'y')
@@ -173,7 +173,7 @@ def _prepare(pane: Any, figure: Figure, trace: Spec, grid_colour: Any) -> None:
     if up.get('type') == 'log':
         pane.set_yscale('log')
     if up.get('type') == 'category':
-        # The rows from top to bottom, as the page has them.
+        # The rows from top to bottom, as on the page.
         order = list(reversed(up.get('categoryarray', [])))
         pane.plot([], [])
         pane.yaxis.update_units(order or trace['y'])
@@ -188,7 +188,7 @@ def _words(axis: Spec) -> str:
 
 
 def _marks(pane: Any, layout: Spec, x: str, y: str) -> None:
-    """Draw the shapes that belong to a pane."""
+    """Draw the shapes of a pane."""
     unit = _DAY_MS if is_date(layout.get(f'xaxis{x[1:]}', {})) else 1.0
     for shape in layout.get('shapes', []):
         across, up = shape.get('xref', 'x'), shape.get('yref', 'y')
@@ -209,7 +209,7 @@ def _marks(pane: Any, layout: Spec, x: str, y: str) -> None:
 
 
 def _draw(pane: Any, trace: Spec, date: bool) -> None:
-    """Draw one trace into a pane; ``date`` tells that x are ms since 1970."""
+    """Draw one trace into a pane; ``date`` is True if x are ms since 1970."""
     x = numbers(trace, 'x') / (_DAY_MS if date else 1.0)
     shown = trace.get('showlegend', True) and trace.get('name')
     label = plain_text(str(trace['name'])) if shown else '_'
@@ -226,7 +226,7 @@ def _draw(pane: Any, trace: Spec, date: bool) -> None:
 def _heights(trace: Spec) -> Any:
     values = column(trace, 'y')
     if any(isinstance(v, str) for v in values):
-        # matplotlib wants words throughout; a gap of x breaks the line all the same.
+        # matplotlib needs strings only; a gap in x interrupts the line anyway.
         words = [v for v in values if isinstance(v, str)]
         return [v if isinstance(v, str) else words[0] for v in values]
     return np.array(values, dtype=np.float64)
@@ -248,7 +248,7 @@ def _scatter(pane: Any, trace: Spec, x: FloatArray, y: Any, label: str) -> None:
     sign, size = str(marker.get('symbol', 'circle')), marker.get('size', 6)
     colour = marker.get('color', look.get('color'))
     if isinstance(colour, list) or isinstance(size, list):
-        # Points that differ in colour or size stand over their line.
+        # Points with individual colours or sizes are drawn over their line.
         pane.plot(x, y, **look)
         sizes = size if isinstance(size, list) else [size] * len(x)
         shades = colour if isinstance(colour, list) else [colour] * len(x)
@@ -292,7 +292,7 @@ def _heat(pane: Any, trace: Spec, x: FloatArray) -> None:
 
 
 def _edges(places: FloatArray, count: int) -> FloatArray:
-    """Return the edges of cells that are given by their middles or by their edges."""
+    """Return the edges of cells given by their centres or by their edges."""
     if len(places) == count + 1:
         return places
     half = 0.5 * (places[1] - places[0]) if count > 1 else 0.5
@@ -300,7 +300,7 @@ def _edges(places: FloatArray, count: int) -> FloatArray:
 
 
 def _bars(pane: Any, trace: Spec, x: FloatArray, label: str) -> None:
-    """Draw bars on top of those that stand there already, as the page stacks them."""
+    """Draw bars on top of existing ones, stacked as on the page."""
     y, colour = numbers(trace, 'y'), trace['marker']['color']
     below = getattr(pane, 'stacked', np.zeros_like(y))
     width = float(x[1] - x[0]) if len(x) > 1 else 1.0

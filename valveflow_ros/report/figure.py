@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A picture as plain data: what plotly draws, with colours by name.
+"""A figure as plain data for plotly, with colours by name.
 
 A colour is written ``token:steady``; the page looks it up in its style sheet
-when it draws, so that the same picture suits light, dark and paper.
+when it draws, so that the same figure suits the light, dark and print themes.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from numpy.typing import NDArray
 from valveflow_ros.records import FloatArray
 
 Spec = dict[str, Any]
-DAY_HOUR = '%{x|%d %b %H:%M}<br>'  # the time at the head of a hover text
+DAY_HOUR = '%{x|%d %b %H:%M}<br>'  # the time in the first line of a hover text
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One picture of the page.
+    """One figure of the page.
 
     Attributes
     ----------
     name : str
-        Letters and dashes; the element's id.
+        Letters and dashes; the id of the HTML element.
     caption : str
-        HTML that says what to look for.
+        HTML text that says what the figure shows.
     description : str
-        Plain text for those who cannot see the picture.
+        Plain text description for screen readers.
     traces : list
         plotly traces.
     layout : dict
-        What differs from the page's base layout.
+        Differences from the base layout of the page.
     height : int
-        In pixels.
+        Height in pixels.
     """
 
     name: str
@@ -58,14 +58,14 @@ class Figure:
     height: int = 420
 
     def to_json(self) -> str:
-        """Return the picture for the page's script; safe inside a script element."""
+        """Return the figure for the script of the page; safe inside a script element."""
         content = {'data': self.traces, 'layout': {**self.layout, 'height': self.height}}
         text = json.dumps(_clean(content), separators=(',', ':'), allow_nan=False)
         return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
 
 
 def _clean(value: Any) -> Any:
-    """Turn numpy scalars into Python's and what is not finite into null."""
+    """Convert numpy scalars to Python's, and values that are not finite to null."""
     if isinstance(value, Mapping):
         return {str(k): _clean(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -77,11 +77,11 @@ def _clean(value: Any) -> Any:
     return value
 
 
-# Numbers for a picture.
+# Numbers for a figure.
 
 
 def rounded(values: NDArray[Any] | Sequence[float], digits: int = 5) -> list[float | None]:
-    """Return values for the eye: so many significant digits of the largest; NaN is a gap."""
+    """Return values rounded to significant digits of the largest; NaN is a gap."""
     values = np.asarray(values, dtype=np.float64)
     good = np.isfinite(values)
     largest = float(np.abs(values[good]).max()) if good.any() else 0.0
@@ -93,7 +93,7 @@ def rounded(values: NDArray[Any] | Sequence[float], digits: int = 5) -> list[flo
 
 
 def moments(time_ms: NDArray[Any] | Sequence[float]) -> list[float | None]:
-    """Return times in ms since 1970 to the ms, as a date axis takes them."""
+    """Return times in ms since 1970, rounded to ms, in the format of a date axis."""
     return rounded(time_ms, 13)
 
 
@@ -104,7 +104,7 @@ def packed(values: NDArray[Any]) -> Spec:
 
 
 def in_zone(figure: Figure, zone: tzinfo) -> Figure:
-    """Return a picture with the times along its axes in a time zone."""
+    """Return a figure with the times on its axes in a time zone."""
     dates = [k for k, v in figure.layout.items() if isinstance(v, Mapping) and is_date(dict(v))]
     if not dates:
         return figure
@@ -131,7 +131,7 @@ def in_zone(figure: Figure, zone: tzinfo) -> Figure:
 
 
 def _moved(mark: Spec, dates: Sequence[str], zone: tzinfo) -> Spec:
-    """Return a shape or an annotation with its places along axes of times in a zone."""
+    """Return a shape or an annotation with its positions on time axes in a zone."""
     new = dict(mark)
     for letter in 'xy':
         ref = str(mark.get(f'{letter}ref', letter))
@@ -145,14 +145,14 @@ def _moved(mark: Spec, dates: Sequence[str], zone: tzinfo) -> Spec:
 
 
 def local_ms(ms: Any, zone: tzinfo) -> Any:
-    """Return ms since 1970 as the clocks of a zone show them; a gap and a word stay."""
+    """Return ms since 1970 as local time of a zone; gaps and strings stay."""
     if not isinstance(ms, int | float) or not math.isfinite(ms):
         return None if isinstance(ms, float) else ms
     offset = datetime.fromtimestamp(ms / 1000.0, timezone.utc).astimezone(zone).utcoffset()
     return ms + (offset.total_seconds() * 1000.0 if offset else 0.0)
 
 
-# Traces, axes and marks. What a caller adds as a keyword is plotly's own and goes before.
+# Traces, axes and marks. Keyword arguments are plotly's and take precedence.
 
 
 def token(name: str) -> str:
@@ -168,7 +168,7 @@ def line(
     x: Any, y: Any, name: str, colour: str, hover: str = '', *, width: float = 2,
     dash: str = '', shape: str = '', **more: Any,
 ) -> Spec:  # fmt: skip
-    """Return a line; without a hover text it cannot be pointed at."""
+    """Return a line; without a hover text it does not react to the pointer."""
     look: Spec = {'color': token(colour), 'width': width}
     look |= {k: v for k, v in (('dash', dash), ('shape', shape)) if v}
     return {'type': 'scatter', 'mode': 'lines', 'name': name, 'x': x, 'y': y, 'line': look,
@@ -179,7 +179,7 @@ def points(
     x: Any, y: Any, name: str, colour: str, hover: str = '', *, size: float = 6,
     marker: Mapping[str, Any] | None = None, **more: Any,
 ) -> Spec:  # fmt: skip
-    """Return a cloud of points; ``marker`` adds to their look."""
+    """Return a cloud of points; ``marker`` adds to their style."""
     look = {'color': token(colour), 'size': size, **(marker or {})}
     return {'type': 'scatter', 'mode': 'markers', 'name': name, 'x': x, 'y': y, 'marker': look,
             **_hover(hover), **more}  # fmt: skip
@@ -193,7 +193,7 @@ def area(x: Any, y: Any, name: str, **more: Any) -> Spec:
 
 
 def error_bars(low: FloatArray, middle: FloatArray, high: FloatArray, **more: Any) -> Spec:
-    """Return the bars from ``low`` to ``high``; of no length where an end is not known."""
+    """Return the bars from ``low`` to ``high``; of length zero if an end is unknown."""
     known = np.isfinite(low) & np.isfinite(high)
     return {'type': 'data', 'symmetric': False,
             'array': rounded(np.where(known, high - middle, 0.0)),
@@ -201,7 +201,7 @@ def error_bars(low: FloatArray, middle: FloatArray, high: FloatArray, **more: An
 
 
 def axis(title: str | Mapping[str, str], **more: Any) -> Spec:
-    """Return an axis; a title with a short form for narrow windows comes as a mapping."""
+    """Return an axis; a title with a short form for narrow windows is a mapping."""
     return {'title': {'text': title} if isinstance(title, str) else dict(title), **more}
 
 
@@ -211,28 +211,28 @@ def time_axis(**more: Any) -> Spec:
 
 
 def stripe(x0: float, x1: float, colour: str, **more: Any) -> Spec:
-    """Return a tinted background between two places of the x axis."""
+    """Return a coloured background between two positions on the x axis."""
     return {'type': 'rect', 'layer': 'below', 'yref': 'paper', 'y0': 0, 'y1': 1, 'x0': x0,
             'x1': x1, 'fillcolor': token(colour), 'line': {'width': 0}, **more}  # fmt: skip
 
 
 def upright(x: float, colour: str, width: float, **look: Any) -> Spec:
-    """Return a line across the picture at one place of the x axis."""
+    """Return a vertical line at one position on the x axis."""
     return {'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1, 'x0': x, 'x1': x,
             'line': {'color': token(colour), 'width': width, **look}}  # fmt: skip
 
 
 def zero_line(x0: float = 0, x1: float = 1, **more: Any) -> Spec:
-    """Return a line at y = 0, by default across the picture."""
+    """Return a line at y = 0, by default across the whole figure."""
     return {'type': 'line', 'xref': 'paper', 'x0': x0, 'x1': x1, 'y0': 0, 'y1': 0,
             'line': {'color': token('muted'), 'width': 1}, **more}  # fmt: skip
 
 
-# The numbers of a picture read back, whichever way plotly was given them.
+# Reading back the numbers of a figure, in any of the formats of plotly.
 
 
 def without_tags(html: str) -> str:
-    """Return HTML without its tags, powers with a caret: ``MPa^(9/8)``; signs stay escaped."""
+    """Return HTML without tags, exponents with a caret: ``MPa^(9/8)``; entities stay escaped."""
     html = re.sub(r'<sup>([^<]*/[^<]*)</sup>', r'^(\1)', html)
     html = re.sub(r'<sup>([^<]*)</sup>', r'^\1', html)
     return re.sub(r'<[^>]+>', '', html)
@@ -244,7 +244,7 @@ def plain_text(html: str) -> str:
 
 
 def column(trace: Spec, axis: str) -> list[Any]:
-    """Return the places of a trace along ``x`` or ``y``: numbers (NaN for a gap) or words."""
+    """Return the positions of a trace on ``x`` or ``y``: numbers (NaN for a gap) or strings."""
     given = trace.get(axis)
     if isinstance(given, dict):
         return list(np.frombuffer(base64.b64decode(given['bdata']), dtype=given['dtype']).tolist())
@@ -262,7 +262,7 @@ def numbers(trace: Spec, axis: str) -> FloatArray:
 
 
 def axis_of(figure: Figure, trace: Spec, letter: str) -> Spec:
-    """Return the layout of the axis a trace is drawn on."""
+    """Return the layout of the axis of a trace."""
     name = str(trace.get(f'{letter}axis', letter))
     return dict(figure.layout.get(f'{letter}axis{name[1:]}', {}))
 
@@ -283,10 +283,10 @@ def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def figure_csv(figure: Figure) -> str:
-    """Return what a picture shows as CSV: one row a point, with the name of its line.
+    """Return the data of a figure as CSV: one row per point, with the name of its line.
 
-    Times are written in UTC. Lines are broken where a row is missing. The values are those that
-    are drawn, thinned out and rounded for the eye; the result's JSON has them unrounded.
+    Times are written in UTC. A row is missing where a line has a gap. The values are the drawn
+    ones, reduced in number and rounded; the JSON of the result has them unrounded.
     """
     rows = []
     for number, trace in enumerate(figure.traces):
@@ -310,7 +310,7 @@ def _cell(value: Any, date: bool = False) -> str:
 
 
 def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
-    """Yield x, y, value, and the ends of the bar through the point."""
+    """Yield x, y, value, and the ends of the error bar of each point."""
     x, y = column(trace, 'x'), column(trace, 'y')
     if trace['type'] == 'heatmap':
         across = _centres(x, len(trace['z'][0]))
@@ -328,7 +328,7 @@ def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
 
 
 def _centres(places: list[Any], count: int) -> list[Any]:
-    """Return the middles of cells that are given by their edges."""
+    """Return the centres of cells given by their edges."""
     if len(places) == count:
         return places
     return [0.5 * (a + b) for a, b in pairwise(places)]

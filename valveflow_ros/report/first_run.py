@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the engine has to be compiled first, which takes about a minute, once."""
+"""Check whether the engine must be compiled first, which takes about a minute, once."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
 _FOLDERS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
 _ENGINE = tuple(f'valveflow_ros.{name}' for name in _FOLDERS)
-# Some are only ever compiled into others, or for tests.
+# Some functions are compiled only as part of others, or for tests.
 _FEW = 0.05
 
 
 def is_first_run() -> bool:
     """Return True if most of the engine is not in numba's cache for this machine and version.
 
-    False as well where nothing is compiled or nothing is known.
+    Return False if there are no compiled functions or if their state is unknown.
     """
     from valveflow_ros.monitoring import monitor  # noqa: F401 - what is asked about must be loaded
 
@@ -34,13 +34,13 @@ def must_compile_to_fit() -> bool:
 
 
 def _cold_share() -> float:
-    """Return which part of the engine's functions that are loaded is not in the cache."""
+    """Return the fraction of the loaded functions of the engine that is not in the cache."""
     known = [cold for dispatcher in _compiled() if (cold := _is_cold(dispatcher)) is not None]
     return sum(known) / len(known) if known else 0.0
 
 
 def _compiled() -> Iterator[Any]:
-    """Yield the compiled functions of the engine's modules that are loaded."""
+    """Yield the compiled functions of the loaded modules of the engine."""
     for name, module in list(sys.modules.items()):
         if name.startswith(_ENGINE):
             yield from (
@@ -51,10 +51,10 @@ def _compiled() -> Iterator[Any]:
 
 
 def _is_cold(dispatcher: Any) -> bool | None:
-    """Return True if a function is not in the cache; None if that is not known."""
+    """Return True if a function is not in the cache; None if unknown."""
     if dispatcher.signatures:
         return False
-    # numba shows no more than the folder, in which there may be older or foreign code.
+    # numba's public interface gives only the folder, which may contain other code.
     file = getattr(getattr(dispatcher, '_cache', None), '_cache_file', None)
     index = getattr(file, '_load_index', None)
     if index is None:

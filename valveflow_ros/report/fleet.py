@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of a fleet: which units lose power, since when and why; one page for each unit."""
+"""The pages of a fleet: which units lose power, since when and why; one page per unit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from valveflow_ros.report.words import VERDICT_WORDS, counted, moment, signed
 
 UNITS, REPORT = 'units', 'report.html'
 _VERBS = ('identify', 'diagnose', 'monitor')
-# Histories on the overview, and rows of what failed; each unit's page has its own.
+# Limits of the overview: histories, and rows of failures; the page of a unit has its own.
 _HISTORIES, _FAILURES = 10, 200
 _UNIT_PX = 18
 Row = Mapping[str, Any]
@@ -26,30 +26,30 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class UnitStory:
-    """What the overview tells of a unit.
+    """The summary of a unit for the overview.
 
     Attributes
     ----------
     unit : str
     logs, failed : int
-        How many there are, and how many of them gave nothing.
+        Number of logs, and number of logs without a result.
     output_unit : str
     moved : bool
-        The last curve differs from the first one by more than chance.
+        The last curve differs significantly from the first one.
     change_mw : float or None
-        By how much, mean over what both curves know; None while there are no two curves.
+        Mean difference over the common range of both; None if there are not two curves.
     piece : str
-        The piece that moved most, in words.
+        The piece with the largest change, in words.
     since : str
-        Since when, in words.
+        Begin of the change, in words.
     causes : tuple of str
-        Names of the causes since then, in the order found.
+        Names of the causes since the change, in the order found.
     alarms : tuple of str
-        Names of those that stand at the end of the last log.
+        Names of the alarms that stand at the end of the last log.
     changes : tuple of (int, float)
         Begin of each log (ns) and its change in MW.
     failures : tuple of (str, str)
-        Log and sentence, also of what was done only in part.
+        Log and sentence, including results that are incomplete.
     history : History
         The curves.
     """
@@ -69,7 +69,7 @@ class UnitStory:
     history: History
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as a dict of plain values."""
+        """Return the summary as a dict of plain values."""
         names = ('unit', 'logs', 'failed', 'output_unit', 'moved', 'change_mw', 'piece', 'since')
         return {
             **{name: getattr(self, name) for name in names},
@@ -79,10 +79,10 @@ class UnitStory:
 
 
 def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
-    """Return the story of a unit from the rows of its logs, in order of time."""
+    """Return the summary of a unit from the rows of its logs, in order of time."""
     curves = [row for row in rows if row.get('curve')]
     last = curves[-1] if curves else {}
-    # The change lasts since the first of the logs at the end that all show it.
+    # The change began in the first of the last consecutive logs that all show it.
     changed: list[Row] = []
     for row in reversed(curves):
         if not row.get('change_moved') or not _same_side(row, last):
@@ -112,10 +112,10 @@ def _same_side(row: Row, last: Row) -> bool:
 
 
 def _since(row: Row) -> str:
-    """Say when the change began: as the diagnosis dates it, as the segments show it, or its log.
+    """Return when the change began: from the diagnosis, the segments, or the start of the log.
 
-    The onset of a cause is fitted to every row, and told more closely than a shift of segments. It
-    does not count outside the interval of the shift: another cause may be of another day.
+    The onset of a cause is fitted to every row, and is more accurate than that of a shift found
+    from segments. It is ignored outside the interval of the shift: it may be of another change.
     """
     low, high = (row.get(f'shift_since_{end}') for end in ('low', 'high'))
     dated: list[tuple[Row, str]] = [
@@ -147,7 +147,7 @@ def _history(curves: Sequence[Row]) -> History:
 
 
 def _link(words: str, *parts: str) -> str:
-    """Return a link to a file beside the page; ``words`` are HTML."""
+    """Return a link to a file next to the page; ``words`` are HTML."""
     return f'<a href="{"/".join(quote(p, safe="") for p in parts)}">{words}</a>'
 
 
@@ -213,7 +213,7 @@ def _units_table(stories: Sequence[UnitStory]) -> str:
 
 
 def changes_figure(stories: Sequence[UnitStory]) -> Figure:
-    """Return the change of each unit against its first curve, one row a unit."""
+    """Return the change of each unit relative to its first curve, one row per unit."""
     shown = [s for s in stories if s.changes]
     starts = [np.array([t for t, _ in s.changes], dtype=np.float64) / 1e6 for s in shown]
     steps = [np.ptp(t) / (len(t) - 1) for t in starts if len(t) > 1 and np.ptp(t) > 0.0]
@@ -295,6 +295,6 @@ def _log_cells(row: Row) -> list[str]:
 
 
 def _moved(row: Row, name: str) -> str:
-    """Say by how much the piece moved that moved most."""
+    """Return the largest change of a piece, in words."""
     low, high = row[f'{name}_u_from'], row[f'{name}_u_to']
     return f'{signed(row[f"{name}_mw"])} {row["output_unit"]} at u {low:.0f} to {high:.0f}'

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor published while it recorded: its curves, its alarms, its diagnoses."""
+"""The messages of a monitor in a recording: its curves, its alarms, its diagnoses."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ from valveflow_ros.report.words import (
 
 @dataclass(frozen=True, slots=True)
 class CurveMoment:
-    """A curve, and when it came into force.
+    """A curve, and the time of its publication.
 
     Attributes
     ----------
     time_ns : int
-        When it was published.
+        Time of its publication.
     model_id : str
     exponent : float
-        Of the pressure in u.
+        Exponent of the pressure in u.
     u, power_mw : float64 (J + 1,)
-        Ends of the pieces and the power there.
+        Ends of the pieces, and the power at them.
     low, high : float64 (J - 1,)
-        Where the inner ends lie with 95 % confidence; NaN if not known.
+        95 % intervals of the inner ends; NaN if unknown.
     rmse_mw : float
     """
 
@@ -69,7 +69,7 @@ class CurveMoment:
 
 @dataclass(frozen=True, slots=True)
 class AlarmMoment:
-    """A change of one alarm's state."""
+    """A change of the state of one alarm."""
 
     time_ns: int
     name: str
@@ -80,7 +80,7 @@ class AlarmMoment:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisMoment:
-    """A diagnosis, and what it said."""
+    """A diagnosis and its result."""
 
     time_ns: int
     sentence: str
@@ -88,18 +88,18 @@ class DiagnosisMoment:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """What a monitor published, each part in order of time.
+    """The messages of a monitor, each kind in order of time.
 
     Attributes
     ----------
     start_ns, end_ns : int
-        First and last moment of the recording, in the plant's time.
+        First and last time of the recording, in the time of the plant.
     curves : tuple of CurveMoment
-        Each curve once, when it first came.
+        Each curve once, at its first publication.
     alarms : tuple of AlarmMoment
     diagnoses : tuple of DiagnosisMoment
     notes : tuple of str
-        What could not be read, as sentences.
+        Sentences about what could not be read.
     """
 
     start_ns: int
@@ -111,13 +111,13 @@ class History:
 
 
 Moment = CurveMoment | AlarmMoment | DiagnosisMoment
-# The alarm whose sentence, not only its moment, changes while it stands.
+# The alarm whose sentence may change without a change of its state.
 _SHIFT = 'curve_shift'
 Item = TypeVar('Item')
 
 
 def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
-    """Return what a message adds to a history; None while there is nothing to show.
+    """Return the entry of a history for a message; None if there is nothing to show.
 
     Raises
     ------
@@ -147,19 +147,19 @@ def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
 def history_of(
     told: Iterable[Moment], times_ns: Iterable[int], notes: Iterable[str]
 ) -> History | None:
-    """Return the history of what was published; None where a log tells nothing of a monitor.
+    """Return the history of the published messages; None if a log contains no monitor.
 
     Parameters
     ----------
     told : iterable of CurveMoment, AlarmMoment, DiagnosisMoment
-        In any order. What is latched is published again and again, and all that stands at a new
-        start: each counts once.
+        In any order. Latched messages are published repeatedly, and standing alarms again after a
+        restart: each counts once.
     times_ns : iterable of int
         Other times of the log, such as those of its first and last reading.
     notes : iterable of str
-        What could not be read, as sentences.
+        Sentences about what could not be read.
     """
-    # What was latched before the plant's clock had told a time has none, and tells nothing yet.
+    # A latched message from before the first plant time has time 0 and is ignored.
     found = sorted((m for m in told if m.time_ns > 0), key=lambda m: m.time_ns)
     said = tuple(notes)
     if not found and not said:
@@ -175,14 +175,14 @@ def history_of(
 
 
 def alarms_of(told: Iterable[AlarmMoment]) -> tuple[AlarmMoment, ...]:
-    """Return the changes among what was told of alarms, in order, each with its last words.
+    """Return the changes in a series of alarm messages, in order, with their last sentences.
 
-    That an alarm still stands, which is told every day, is no change; but how far a shift has gone
-    is known better then. The first word of a standing alarm counts even so: it stood when the
-    recording began.
+    The daily repetition of a standing alarm is not a change, but its sentence on the size of a
+    shift is more accurate and replaces the earlier one. The first message of a standing alarm
+    counts: it stood at the start of the recording.
     """
     changes: list[AlarmMoment] = []
-    last: dict[str, int | None] = {}  # where the last change of an alarm stands
+    last: dict[str, int | None] = {}  # index of the last change of each alarm
     for a in told:
         place = last.get(a.name)
         if not a.again or (a.name not in last and a.state != AlarmState.NORMAL):
@@ -196,14 +196,14 @@ def alarms_of(told: Iterable[AlarmMoment]) -> tuple[AlarmMoment, ...]:
 
 
 def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:
-    """Return each item when it first came."""
+    """Return each item only at its first occurrence."""
     first: dict[Hashable, Item] = {}
     for item in items:
         first.setdefault(key(item), item)
     return list(first.values())
 
 
-# Word, colour and sign of each state that is worth a bar, the gravest first.
+# Text, colour and symbol of each state that is drawn as a bar, the most severe first.
 _STATES = {
     AlarmState.UNACKNOWLEDGED: ('stands, nobody acknowledged', 'steady', 'diamond'),
     AlarmState.ACKNOWLEDGED: ('stands, acknowledged', 'chosen', 'circle'),
@@ -215,11 +215,11 @@ _STATES = {
 _WORDS = {AlarmState.NORMAL: 'normal', **{s: words for s, (words, _, _) in _STATES.items()}}
 _ROW = 46  # pixels
 _MOST = 40
-_LINE = 60  # signs of a hover before it breaks
+_LINE = 60  # characters per line of a hover text
 
 
 def history_sections(history: History | None) -> list[Section]:
-    """Return the parts of the page about a monitor's recording; none for other logs."""
+    """Return the page sections about the recording of a monitor; none for other logs."""
     if history is None:
         return []
     sections = []
@@ -241,7 +241,7 @@ def history_sections(history: History | None) -> list[Section]:
 
 
 def spans(history: History) -> list[tuple[str, AlarmState, int, int, str]]:
-    """Return name, state, begin, end and sentence of every stretch in which a state held."""
+    """Return name, state, begin, end and sentence of every interval with one state."""
     found = []
     for name in _names(history):
         changes = [a for a in history.alarms if a.name == name]
@@ -254,7 +254,7 @@ def spans(history: History) -> list[tuple[str, AlarmState, int, int, str]]:
 
 
 def standing_s(history: History) -> float:
-    """Return for how long any alarm's condition stood, in s."""
+    """Return the total time in which the condition of any alarm held, in s."""
     stands = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
     held = sorted((a, b) for _, state, a, b, _ in spans(history) if state in stands)
     total, until = 0, -(1 << 62)
@@ -269,12 +269,12 @@ def _names(history: History) -> list[str]:
 
 
 def _row_of(name: str) -> str:
-    """Return an alarm's name as the figure and the table show it: both read HTML."""
+    """Return the name of an alarm for the figure and the table, as HTML."""
     return text(name.replace('_', ' '))
 
 
 def _broken(sentence: str) -> str:
-    """Break a sentence into lines for a hover."""
+    """Split a sentence into lines for a hover text."""
     lines = ['']
     for word in text(sentence).split():
         if lines[-1] and len(lines[-1]) + len(word) >= _LINE:
@@ -305,7 +305,7 @@ def timeline_figure(history: History) -> Figure:
         traces += _bars(history, state)
     names = _names(history)
     rows = [row for row, (_, found) in said.items() if found] + [_row_of(n) for n in names]
-    room = 0.015 * (history.end_ns - history.start_ns)  # for a sign at either end
+    room = 0.015 * (history.end_ns - history.start_ns)  # space for a symbol at each end
     ends = moments([(history.start_ns - room) / 1e6, (history.end_ns + room) / 1e6])
     layout: Spec = {
         'xaxis': time_axis(range=ends),
@@ -331,7 +331,7 @@ def _bars(history: History, state: AlarmState) -> list[Spec]:
     mine = [s for s in spans(history) if s[1] is state]
     if not mine:
         return []
-    # A gap between two stretches, so that no line joins them.
+    # A gap between two intervals, so that no line connects them.
     x = moments([t for _, _, a, b, _ in mine for t in (a / 1e6, b / 1e6, np.nan)])
     y = [cell for name, *_ in mine for cell in (_row_of(name), _row_of(name), None)]
     hover = [
@@ -351,7 +351,7 @@ def _bars(history: History, state: AlarmState) -> list[Spec]:
 
 
 def alarms_table(history: History) -> str:
-    """Return the last changes in words; empty if nothing ever changed."""
+    """Return the last changes as a table; empty if there are none."""
     if not history.alarms:
         return ''
     shown = history.alarms[-_MOST:]
@@ -366,7 +366,7 @@ def alarms_table(history: History) -> str:
     return paragraph(told) + folded(f'{what} in words', body)
 
 
-# Colour and sign of each input that is followed: told apart without colours too.
+# Colour and symbol for each of the fixed inputs, distinguishable without colours.
 _LOOKS = (
     ('chosen', 'circle'), ('slope', 'square'), ('notice-rule', 'diamond'),
     ('steady', 'triangle-up'), ('curve', 'x'),
@@ -391,23 +391,23 @@ def _curves(history: History) -> list[str | Figure]:
 
 
 def followed(history: History) -> FloatArray:
-    """Return the inputs whose power is followed: evenly over the range of the last curve."""
+    """Return the fixed inputs of the figure: evenly spaced in the range of the last curve."""
     last = history.curves[-1].u
     return np.linspace(float(last[0]), float(last[-1]), len(_LOOKS) + 2)[1:-1]
 
 
 def powers(curves: tuple[CurveMoment, ...], u: FloatArray) -> FloatArray:
-    """Return each curve's power at each input, MW, NaN outside a curve: (curves, inputs)."""
+    """Return the power of each curve at each input, MW, NaN outside a curve: (curves, inputs)."""
     return np.array([np.interp(u, c.u, c.power_mw, left=np.nan, right=np.nan) for c in curves])
 
 
 def largest_move(history: History) -> tuple[float, float]:
-    """Return where the last curve differs most from the one before, and by how much in MW."""
+    """Return u of the largest difference of the last two curves, and the difference in MW."""
     before, last = history.curves[-2:]
     low, high = max(before.u[0], last.u[0]), min(before.u[-1], last.u[-1])
     if high <= low:
         return float('nan'), float('nan')
-    # Between two knots of either the difference is straight: its extreme lies at a knot.
+    # The difference is piecewise linear, so its extreme is at a breakpoint of one curve.
     knots = np.unique(np.clip(np.concatenate([before.u, last.u]), low, high))
     moved = np.interp(knots, last.u, last.power_mw) - np.interp(knots, before.u, before.power_mw)
     k = int(np.argmax(np.abs(moved)))
@@ -415,7 +415,7 @@ def largest_move(history: History) -> tuple[float, float]:
 
 
 def curve_history_figure(history: History) -> Figure:
-    """Return the power at fixed inputs, and the breakpoints, from curve to curve."""
+    """Return the power at fixed inputs and the breakpoints, over the times of the curves."""
     first, last = history.curves[0], history.curves[-1]
     layout: Spec = {
         'xaxis': time_axis(anchor='y2'),
@@ -442,7 +442,7 @@ def curve_history_figure(history: History) -> Figure:
 
 def _power_lines(history: History) -> list[Spec]:
     u = followed(history)
-    # The last curve holds until the end of the recording.
+    # The last curve is valid until the end of the recording.
     times = [c.time_ns for c in history.curves]
     at = moments([t / 1e6 for t in (*times, max(history.end_ns, times[-1]))])
     traces = []

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The report of an identification: the answer first, then the evidence."""
+"""The report of an identification: the result first, then the evidence."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ def identification_report(data: Identified) -> str:
 
 
 def identification_page(data: Identified) -> Page:
-    """Return the report: the answer and its picture first, then the evidence."""
+    """Return the report: the result and its figure first, then the evidence."""
     c = data.characteristic
     tag = data.settings.text('unit_tag')
     named = tag != PARAMETERS['unit_tag'].default
     title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
     times = period(c.source.window_start_ns, c.source.window_end_ns)
-    # A picture for which there is nothing to show is left out.
+    # A figure without data is left out.
     evidence = [signals_figure(data), segments_figure(data)]
     missing = [presence_figure(data), coverage_figure(data)]
     sections = [
@@ -89,7 +89,7 @@ def identification_page(data: Identified) -> Page:
 
 
 def _choice(c: Characteristic) -> Section:
-    """Return why there are so many pieces; without a turning angle there is nothing to draw."""
+    """Return the choice of the number of pieces; without turning angles there is no figure."""
     title, choice = 'Why this number of pieces', c.choice
     if not choice.turning_angle and choice.rule in (RULE, STATIC_RULE):
         return Section(title, [paragraph(text(choice.note))])
@@ -116,7 +116,7 @@ def _read(data: Identified) -> str:
 
 
 def _settings(settings: Settings) -> str:
-    """Return the parameters that were not left at their default."""
+    """Return the parameters that differ from their default."""
     rows = [
         [
             text(name),

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the report of an identification is made from, and what it derives once for all parts."""
+"""The input of the identification report, and values derived once for all of its parts."""
 
 from __future__ import annotations
 
@@ -27,39 +27,39 @@ from valveflow_ros.signals.static_form import OPENING
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """An identification and the data it came from.
+    """An identification and its data.
 
     Attributes
     ----------
     source : str
-        Name of the log, as the person wrote it.
+        Name of the log, as given by the user.
     characteristic : Characteristic
     table : SampleTable
-        The aligned rows the engine saw.
+        The aligned rows used by the engine.
     segments : tuple of SpecialSegment
         In order of time.
     counts : mapping
-        ``{topic: {reason: readings}}`` as the aligner counted them.
+        ``{topic: {reason: readings}}`` as counted by the aligner.
     settings : Settings
     notes : tuple of str
-        Sentences about how the data were read, for a person.
+        Sentences about how the data were read.
     shift : Shift, optional
-        The judgement against ``reference``, where there was one.
+        The judgement against ``reference``, if there is one.
     reference : Characteristic, optional
     misfit : Misfit, optional
-        Where the curve is wrong again and again.
+        Systematic error of the curve.
     mixture : str
-        That the unit changed within the data, as a sentence; empty if it did not.
+        A sentence that the unit changed within the data; empty if it did not.
     history : History, optional
-        What a monitor published meanwhile, where the log is its recording.
+        Messages of a monitor, if the log is its recording.
     u : float64 (n,)
-        What the curve is a function of, in each row: integrated input or opening.
+        Argument of the curve in each row: integrated input or opening.
     static_mw : float64 (n,)
-        Power of the curve in each row; beyond its ends the outer pieces go on.
+        Power of the curve in each row; the outer pieces are extrapolated.
     rows : int64 (k, 2)
-        First and end row of each segment.
+        First and end row (exclusive) of each segment.
     special : int64 (m,)
-        The rows inside segments whose input and power are known.
+        The rows inside segments with known input and power.
     """
 
     source: str
@@ -80,7 +80,7 @@ class Identified:
     special: IntArray = field(init=False)
 
     def __post_init__(self) -> None:
-        """Derive what several parts need."""
+        """Compute the derived values."""
         u, scale = self.characteristic.static_form.of_rows(
             self.table.column(Signal.VALVE_OPENING),
             self.table.column(Signal.MAIN_STEAM_PRESSURE),
@@ -104,14 +104,14 @@ class Identified:
 
     @property
     def shown(self) -> Characteristic:
-        """Return the curve as it is drawn: at the reference pressure where it depends on one."""
+        """Return the curve as drawn: at the reference pressure if it depends on the pressure."""
         return self.characteristic.at_pressure()
 
     @property
     def power_shown(self) -> FloatArray:
-        """Return the power as it is drawn beside the curve, in MW.
+        """Return the power as drawn with the curve, in MW.
 
-        What the curve gives more or less than at the reference pressure is taken off.
+        The difference of the curve from that at the reference pressure is subtracted.
         """
         if self.characteristic.axis != OPENING:
             return self.power
@@ -119,7 +119,7 @@ class Identified:
 
     @property
     def at_pressure(self) -> str:
-        """Return ' at 12.3 MPa' where the curve is shown at one pressure, else nothing."""
+        """Return ' at 12.3 MPa' if the curve is shown at one pressure, else ''."""
         if self.characteristic.axis != OPENING:
             return ''
         return f' at {self.characteristic.reference_pressure_mpa:.3g} MPa'

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The page: sections of text, tables and pictures in one self-contained file."""
+"""The page: sections of text, tables and figures in one self-contained file."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from valveflow_ros.signals.units import in_unit
 
 
 def read_text(name: str) -> str:
-    """Return a file that lies beside this module."""
+    """Return a file in the folder of this module."""
     return resources.files('valveflow_ros.report').joinpath(name).read_text(encoding='utf-8')
 
 
 def plotly_script() -> Path:
-    """Return the path of plotly.js, found without importing plotly, which takes long.
+    """Return the path of plotly.js without importing plotly, which is slow.
 
     Raises
     ------
     InputError
-        plotly is not installed, or not completely.
+        plotly is missing or incomplete.
     """
     spec = find_spec('plotly')
     if spec is None or spec.origin is None:
@@ -59,11 +59,11 @@ def packed_plotly() -> str:
     return base64.b64encode(gzip.compress(script, 9, mtime=0)).decode()
 
 
-# A cell of more signs may be broken on a telephone, and of more still anywhere.
+# A cell with more characters may be wrapped on a phone, and with still more everywhere.
 _NUMBER, _SENTENCE = 16, 34
 _WORDS = ' class="words"'
-_MANY = 4  # columns; more do not fit side by side on a telephone
-# Nothing may be loaded from anywhere: the browser itself sees to it.
+_MANY = 4  # more columns do not fit on a phone
+# The page must not load anything: the browser enforces this.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     'img-src data: blob:; font-src data:'
@@ -82,7 +82,7 @@ class Section:
     title : str
         Plain text.
     parts : list
-        HTML (str) and pictures in the order in which they stand.
+        HTML (str) and figures in their order.
     """
 
     title: str
@@ -91,17 +91,17 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A report before it is written: as a page, or its pictures one by one.
+    """A report before it is written, as one page or as separate figures.
 
     Attributes
     ----------
     title : str
-        Plain text, also the window's title.
+        Plain text, also the title of the window.
     lead, foot : str
-        HTML under the title and at the end.
+        HTML below the title and at the end.
     sections : list of Section
     verb : str
-        Whose report it is; the file says so to programs.
+        The command that made the report; stored in the file for programs.
     """
 
     title: str
@@ -111,11 +111,11 @@ class Page:
     verb: str
 
     def in_unit(self, unit: str) -> Page:
-        """Return the page with its texts and pictures about an output in another unit than MW."""
+        """Return the page with texts and figures for an output in another unit than MW."""
         return self if unit == 'MW' else self._said(lambda text: in_unit(text, unit))
 
     def in_zone(self, zone: tzinfo | None) -> Page:
-        """Return the page with the times in its texts and pictures in a time zone; None: UTC."""
+        """Return the page with the times in its texts and figures in a time zone; None: UTC."""
         if zone is None:
             return self
         page = self._said(lambda text: in_zone(text, zone))
@@ -128,7 +128,7 @@ class Page:
         return replace(page, sections=sections)
 
     def _said(self, change: Callable[[str], str]) -> Page:
-        """Return the page with all that is said on it changed."""
+        """Return the page with a function applied to all of its texts."""
 
         def told(value: Any) -> Any:
             if isinstance(value, str):
@@ -138,7 +138,7 @@ class Page:
             if isinstance(value, dict):
                 return {key: told(v) for key, v in value.items()}
             if isinstance(value, Figure):
-                # The name is the element's id, and that of files.
+                # The name stays: it is the id of the element and part of file names.
                 words = (told(getattr(value, name)) for name in _FIGURE_WORDS)
                 return replace(value, **dict(zip(_FIGURE_WORDS, words, strict=True)))
             return value
@@ -151,7 +151,7 @@ class Page:
 
     @property
     def figures(self) -> list[Figure]:
-        """Return the pictures in their order."""
+        """Return the figures in their order."""
         return [p for s in self.sections for p in s.parts if isinstance(p, Figure)]
 
     def to_html(self) -> str:
@@ -176,12 +176,12 @@ class Page:
 
 
 def text(value: object) -> str:
-    """Escape what came from outside: names of files, tags, sentences."""
+    """Escape external text for HTML: names of files, tags, sentences."""
     return escape(str(value), quote=True)
 
 
 def paragraph(html: str, kind: str = '') -> str:
-    """Return a paragraph of ready HTML."""
+    """Return a paragraph of given HTML."""
     return f'<p class="{kind}">{html}</p>' if kind else f'<p>{html}</p>'
 
 
@@ -193,19 +193,19 @@ def table(
     first: str = 'name',
     sentences: bool = False,
 ) -> str:
-    """Return a table of ready HTML cells.
+    """Return a table of cells given as HTML.
 
-    On a telephone a table of many columns shows each row as a list of its own; for that
-    each cell carries the name of its column.
+    On a phone a table with many columns shows each row as a list; therefore each cell has the
+    name of its column as an attribute.
 
     Parameters
     ----------
     first : str
-        'name' if the first column names the row, 'number' if it is a value like the others.
+        'name' if the first column names the row, 'number' if it is a value.
     sentences : bool
-        Some cells are sentences: the table counts as one of many columns.
+        Some cells are sentences: the table is treated as one with many columns.
     """
-    # Where no HTML can stand.
+    # Attributes cannot contain HTML.
     labels = [without_tags(h).replace('&shy;', '').replace('"', '&quot;') for h in head]
     many = sentences or len(head) > _MANY
 
@@ -213,7 +213,7 @@ def table(
         words = _breaks(html)
         if k == 0 and first == 'name':
             return f'<th scope="row" data-label="{labels[k]}">{html}</th>'
-        # There a cell's name and its content stand side by side: the content must be one thing.
+        # In the list layout, label and content are side by side: the content must be one element.
         whole = f'<span>{html}</span>' if many and '<' in html else html
         return f'<td data-label="{labels[k]}"{words}>{whole}</td>'
 
@@ -233,7 +233,7 @@ def table(
 
 
 def _breaks(html: str) -> str:
-    """Return whether a cell may be broken into lines, as a class: a number never is."""
+    """Return the class of a cell that may be wrapped; numbers are not wrapped."""
     signs = len(re.sub(r'<[^>]+>', '', html))
     if signs > _SENTENCE:
         return _WORDS
@@ -241,12 +241,12 @@ def _breaks(html: str) -> str:
 
 
 def bullets(items: Iterable[str]) -> str:
-    """Return a list of ready HTML."""
+    """Return a list of items given as HTML."""
     return '<ul>' + ''.join(f'<li>{item}</li>' for item in items) + '</ul>'
 
 
 def where(*lines: str) -> str:
-    """Return what a page is about, under its title: sources and times, as plain text."""
+    """Return the subtitle of a page: sources and times, given as plain text."""
     return ''.join(paragraph(text(line), 'where') for line in lines)
 
 
@@ -256,12 +256,12 @@ def foot(rest: str) -> str:
 
 
 def folded(title: str, html: str) -> str:
-    """Return ready HTML behind a line that opens it; on paper it stands open."""
+    """Return HTML that can be expanded; it is always expanded in print."""
     return f'<details><summary>{title}</summary>{html}</details>'
 
 
 def notice(html: str) -> str:
-    """Return a paragraph that must not be overlooked."""
+    """Return a highlighted paragraph."""
     return f'<p class="notice" role="note">{html}</p>'
 
 

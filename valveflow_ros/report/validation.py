@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a validation: does the curve hold, and where not."""
+"""The report of a validation: whether the curve is still valid, and where it is not."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ LABELS = {
     'against.curve': 'the other, curve',
     'against.simulated': 'the other, simulated',
 }
-OUTSIDE_FLAG = 0.05  # share of special samples beyond the curve that is worth a warning
+OUTSIDE_FLAG = 0.05  # fraction of special samples outside the curve that causes a warning
 _KINDS = (
     (SegmentKind.STEADY, 'steady', 'steady state'), (SegmentKind.SLOPE, 'slope', 'slope response'),
 )  # fmt: skip
@@ -70,17 +70,17 @@ _DIFFERENCE = 'measured − predicted (MW)'
 
 @dataclass(frozen=True, slots=True)
 class Validated:
-    """A validation and where it came from.
+    """A validation and its sources.
 
     Attributes
     ----------
     source, model, other : str
-        Names of log and models; ``other`` is empty without one.
+        Names of the log and the models; ``other`` is empty without a second model.
     result : Validation
     contents : WindowContents
     notes : tuple of str
     held : str
-        What there is to say of causes held; empty without any.
+        A sentence about causes that were removed; empty if there are none.
     """
 
     source: str
@@ -151,7 +151,7 @@ def _verdict(v: Validation) -> str:
         )
     real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
     which = 'For the mean over all segments'
-    # The pieces that leave the verdict open.
+    # The pieces without a clear result.
     if unsettled := [
         str(k) for k, c in enumerate(v.pieces, 1) if c.segments and not c.within(v.tolerance_mw)
     ]:
@@ -167,7 +167,7 @@ def _verdict(v: Validation) -> str:
 
 
 def validation_page(data: Validated) -> Page:
-    """Return the report: the verdict and where it comes from, then the evidence."""
+    """Return the report: the verdict and its basis first, then the evidence."""
     v = data.result
     first, *rest = verdict_words(data)
     flag = v.outside_share > OUTSIDE_FLAG
@@ -214,7 +214,7 @@ def _markers(v: Validation, by_time: bool) -> list[Spec]:
 
 
 def _layout(v: Validation, across: Spec) -> Spec:
-    """Return the layout of a picture of differences, with the tolerance as a band."""
+    """Return the layout of a figure of differences, with the tolerance as a band."""
     tolerance = {
         'type': 'rect', 'xref': 'paper', 'yref': 'y', 'x0': 0, 'x1': 1, 'layer': 'below',
         'y0': -v.tolerance_mw, 'y1': v.tolerance_mw, 'line': {'width': 0},
@@ -278,7 +278,7 @@ def totals_table(v: Validation) -> str:
 
 
 def segments_table(v: Validation, most: int = 40) -> str:
-    """Return the segments that differ most."""
+    """Return the segments with the largest differences."""
 
     def size(s: JudgedSegment) -> float:
         t = s.scores[v.judged_by].effective.t

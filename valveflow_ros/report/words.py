@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers, times and units as people read them: rounded by what they are worth."""
+"""Numbers, times and units as text, rounded according to their uncertainty."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from valveflow_ros.records import NS_PER_S
 
 if TYPE_CHECKING:
-    # The compiler behind it takes half a second to load, and `info` shows no curve.
+    # Importing it loads the compiler, which takes half a second, and `info` shows no curve.
     from valveflow_ros.curve.characteristic import HeldCause
 
 UNKNOWN = 'unknown'
@@ -22,7 +22,7 @@ _MINUS = '−'
 
 
 def plain(value: float, digits: int = 4) -> str:
-    """Write ``value`` with that many significant digits, never in powers of ten if readable.
+    """Return ``value`` with ``digits`` significant digits, without powers of ten if possible.
 
     NaN and infinity become the word 'unknown'.
     """
@@ -40,7 +40,7 @@ def plain(value: float, digits: int = 4) -> str:
 
 
 def decimals(value: float, places: int) -> str:
-    """Write ``value`` with a fixed number of decimals; 'unknown' if it is not finite."""
+    """Return ``value`` with a fixed number of decimals; 'unknown' if it is not finite."""
     if not math.isfinite(value):
         return UNKNOWN
     text = f'{value:.{places}f}'
@@ -50,34 +50,34 @@ def decimals(value: float, places: int) -> str:
 
 
 def level(value: float, places: int) -> str:
-    """Write ``value`` as `decimals` does, with more of them where those leave no two digits."""
+    """Return ``value`` like `decimals`, with more decimals for at least two digits."""
     return decimals(value, max(places, places_for(abs(value))))
 
 
 def signed(value: float, places: int = 1) -> str:
-    """Write a number with its sign and a fixed number of decimals."""
+    """Return a number with its sign and a fixed number of decimals."""
     text = decimals(value, places)
     return f'+{text}' if value > 0.0 and float(f'{value:.{places}f}') else text
 
 
 def p_value(value: float) -> str:
-    """Write the p value of a test: 'p = 0.03', 'p < 0.0001', 'not tested'."""
+    """Return the p value of a test: 'p = 0.03', 'p < 0.0001', 'not tested'."""
     if not math.isfinite(value):
         return 'not tested'
     return 'p < 0.0001' if value < 1e-4 else f'p = {plain(value, 2)}'
 
 
 def places_for(error: float, digits: int = 2) -> int:
-    """Return the decimals at which an error shows ``digits`` significant digits."""
+    """Return the number of decimals at which an error has ``digits`` significant digits."""
     if not math.isfinite(error) or error <= 0.0:
         return 0
     return max(0, digits - 1 - math.floor(math.log10(error)))
 
 
 def with_error(value: float, error: float, unit: str = '') -> str:
-    """Write 'value ± error', both rounded to two digits of the error.
+    """Return 'value ± error', both rounded to two digits of the error.
 
-    Without a known error the value stands alone, with four digits.
+    If the error is unknown, return the value with four digits.
     """
     tail = f' {unit}' if unit else ''
     if not math.isfinite(value):
@@ -89,17 +89,17 @@ def with_error(value: float, error: float, unit: str = '') -> str:
 
 
 def is_known(value: float, error: float) -> bool:
-    """Return whether a time is told: its standard error, if it has one, does not exceed it."""
+    """Return True if a time is larger than its standard error, or has none."""
     return not error > value
 
 
 def time_with_error(value_s: float, error_s: float, unit: str = '') -> str:
-    """Write a time constant or delay; 'not known' where its standard error exceeds it."""
+    """Return a time constant or delay; 'not known' if its standard error is larger."""
     return with_error(value_s, error_s, unit) if is_known(value_s, error_s) else NOT_KNOWN
 
 
 def interval(low: float, high: float) -> str:
-    """Write 'low to high' with the digits its width deserves; 'unknown' if an end is."""
+    """Return 'low to high', rounded according to its width; 'unknown' if an end is not finite."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return UNKNOWN
     places = places_for(high - low)
@@ -107,34 +107,34 @@ def interval(low: float, high: float) -> str:
 
 
 def span(low: float, high: float, places: int = 0) -> str:
-    """Write 'low to high' with a fixed number of decimals; more where they are close together."""
+    """Return 'low to high' with a fixed number of decimals; more if they are close together."""
     places = max(places, places_for(abs(high - low)))
     return f'{decimals(float(low), places)} to {decimals(float(high), places)}'
 
 
 def count(value: int) -> str:
-    """Write a whole number in groups of three."""
+    """Return a whole number with digits in groups of three."""
     return f'{value:,}'.replace(',', '\u202f')
 
 
 def counted(value: int, one: str, many: str = '') -> str:
-    """Write a number and its noun: '1 piece', '4 pieces'."""
+    """Return a number and its noun: '1 piece', '4 pieces'."""
     return f'{count(value)} {one if value == 1 else many or one + "s"}'
 
 
 def percent(share: float, digits: int = 3) -> str:
-    """Write a share of one in percent; a share that is not quite all never reads as all."""
+    """Return a fraction in percent; a fraction just below 1 is never shown as 100 %."""
     if not math.isfinite(share):
         return UNKNOWN
     if 0.99 < share < 1.0:
-        # Near all of it, what is missing decides how many digits are worth writing.
+        # Near 100 % the number of digits depends on the difference from 100 %.
         places = places_for(100.0 * (1.0 - share))
         return f'{decimals(100.0 * share, places)} %' if places <= 4 else '> 99.99 %'
     return f'{plain(100.0 * share, digits)} %'
 
 
 def duration(seconds: float) -> str:
-    """Write a length of time with its two largest units: '9 d 23 h', '12 min 5 s', '0.5 s'."""
+    """Return a duration with its two largest units: '9 d 23 h', '12 min 5 s', '0.5 s'."""
     if not math.isfinite(seconds):
         return UNKNOWN
     if seconds < 60.0:
@@ -142,7 +142,7 @@ def duration(seconds: float) -> str:
     sizes = ((86400, 'd'), (3600, 'h'), (60, 'min'), (1, 's'))
     large = next(k for k, (size, _) in enumerate(sizes) if seconds >= size)
     small = min(large + 1, len(sizes) - 1)
-    # Rounded to the smaller unit, so that ten days less a second read as ten days.
+    # Round to the smaller unit, so that ten days minus a second is shown as ten days.
     left = round(seconds / sizes[small][0]) * sizes[small][0]
     parts = []
     for size, name in sizes[: small + 1]:
@@ -153,7 +153,7 @@ def duration(seconds: float) -> str:
 
 
 def moment(time_ns: int) -> str:
-    """Write a time as '2023-11-15 00:00:00 UTC'."""
+    """Return a time as '2023-11-15 00:00:00 UTC'."""
     second = time_ns // NS_PER_S
     try:
         at = datetime.fromtimestamp(second, tz=timezone.utc)
@@ -166,7 +166,7 @@ _UTC_MOMENT = re.compile(r'(\d{4}-\d\d-\d\d \d\d:\d\d(?::\d\d)?) UTC(?![\w+-])')
 
 
 def in_zone(said: str, zone: tzinfo | None) -> str:
-    """Return a text with its times, as '2023-11-15 00:00 UTC', told in a time zone; None: UTC."""
+    """Return a text with its times, like '2023-11-15 00:00 UTC', in a time zone; None: UTC."""
     if zone is None:
         return said
 
@@ -178,12 +178,12 @@ def in_zone(said: str, zone: tzinfo | None) -> str:
 
 
 def period(start_ns: int, end_ns: int) -> str:
-    """Write two times as 'from to'."""
+    """Return two times as 'from to'."""
     return f'{moment(int(start_ns))} to {moment(int(end_ns))}'
 
 
 def exponent(value: float) -> str:
-    """Write the pressure exponent as people know it: 9/8, or a decimal number."""
+    """Return the pressure exponent in its usual form: 9/8, or a decimal number."""
     near = Fraction(value).limit_denominator(16)
     if near.denominator > 1 and abs(float(near) - value) < 1e-9:
         return f'{near.numerator}/{near.denominator}'
@@ -191,7 +191,7 @@ def exponent(value: float) -> str:
 
 
 def input_unit(value: float) -> str:
-    """Return the unit of u as HTML; m stands for an exponent that is not known.
+    """Return the unit of u as HTML, with m for an unknown exponent.
 
     With the exponent 0 u is the opening.
     """
@@ -211,7 +211,7 @@ def per_input(value: float) -> str:
 
 
 def input_unit_plain(value: float) -> str:
-    """Return the unit of u as plain text: '% MPa^(9/8)'; of an exponent not known, '% MPa^m'."""
+    """Return the unit of u as plain text: '% MPa^(9/8)'; '% MPa^m' for an unknown exponent."""
     if not math.isfinite(value):
         return '% MPa^m'
     if value == 0.0:
@@ -221,7 +221,7 @@ def input_unit_plain(value: float) -> str:
 
 
 def input_axis(value: float) -> dict[str, str]:
-    """Return the title of an axis of u, and a short one for narrow pictures, as HTML."""
+    """Return the title of an axis of u, and a short one for narrow figures, as HTML."""
     if value == 0.0:
         return {'text': 'u = V, valve opening (%)', 'short': 'u = V (%)'}
     m = exponent(value) if math.isfinite(value) else 'm'
@@ -229,15 +229,15 @@ def input_axis(value: float) -> dict[str, str]:
     return {'text': long, 'short': f'u ({input_unit(value)})'}
 
 
-# Causes whose change is counted from the mean of the record, see `diagnosis.causes`.
+# Causes that are relative to their mean over the record, see `diagnosis.causes`.
 _FROM_THE_MEAN = frozenset(('gain_drift', 'input_drift', 'intervals', 'output_offset_drift'))
 
 
 def held_words(held: tuple[HeldCause, ...]) -> str:
-    """Say which causes were taken out of the rows; nothing where none were."""
+    """Return which causes were removed from the rows; empty if there are none."""
     if not held:
         return ''
-    # When a cause began stands as a date in its sentence; a number of days says nothing.
+    # The onset is given as a date in the sentence; a number of days is not informative.
     told = [(h, ', '.join(f'{n} = {v:.4g}' for n, v in h.values if n != 't0_days')) for h in held]
     names = ', '.join(f'{h.name} ({values})' if values else h.name for h, values in told)
     if any(h.name in _FROM_THE_MEAN for h in held):
@@ -261,7 +261,7 @@ VERDICT_WORDS = {
 
 
 def advice(name: str, meaning: str, to_do: str) -> str:
-    """Return what a named cause is worth in MW and what to do about it; empty if neither is known.
+    """Return the effect of a cause in MW and the recommended action; empty if both are unknown.
 
     The arguments are those of a cause in ``diagnosis.json``.
     """

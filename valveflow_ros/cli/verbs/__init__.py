@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One module for each verb: `arguments` adds its options, `run` does it."""
+"""One module per verb: `arguments` adds its options, `run` runs it."""

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow compare``: the proposed method beside the two of the literature."""
+"""``valveflow compare``: compare the proposed method with two from the literature."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Open, identify in three ways and judge, write."""
+    """Open the log, identify in three ways, judge, write."""
     mapping = mapping_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.compare import compare
@@ -72,7 +72,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     console(0.95, 'writing the report')
     data = found.data
     text = lines(data_words(data), *finding_words(data), _parameters(data), _errors(data))
-    # The segments stand in the file only.
+    # The segments are only written to the file.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
     return write_results(found, options, text, brief)
 

@@ -75,7 +75,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Read, invert, check, write."""
+    """Read the curve, invert, check, write."""
     from valveflow_ros.curve.compensation import compensate
     from valveflow_ros.interface.files import TABLES, check_output
     from valveflow_ros.interface.models import load_characteristic
@@ -86,7 +86,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     console.measured_in(curve.output_unit)
     pressures, shown = sorted(set(options.pressure)), curve
     if curve.axis == OPENING:
-        # Its knees stand at other powers at each pressure.
+        # At each pressure its breakpoints are at other powers.
         if len(pressures) > 1:
             raise UsageError(
                 'The breakpoints of this curve are at fixed openings, and at another power for '
@@ -125,7 +125,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compensation]) -> None:
-    """Refuse an inverse or a table that is not exact enough, and say how many points would do.
+    """Raise if the inverse or the table is inaccurate; give the necessary number of points.
 
     ``again`` makes the same table with another number of points.
     """
@@ -148,7 +148,7 @@ def _check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compe
             f'it takes {least.table_mw:.2g} MW are left, from rounding. Ask for a larger '
             '--tolerance. Nothing was written.'
         )
-    # The error of the best choice of corners falls with their number.
+    # With the best positions of the points the error decreases with their number.
     tried = range(2, corners + 1)
     enough = tried[bisect_left(tried, True, key=lambda n: again(n).table_mw <= tolerance_mw)]
     raise DataError(
@@ -158,7 +158,7 @@ def _check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compe
 
 
 def _table(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArray]:
-    """Return the columns of the table; the opening in % of full opening, not limited to 100."""
+    """Return the columns of the table; opening in % of full opening, not limited to 100."""
     import numpy as np
 
     exponent = made.curve.pressure_exponent
@@ -175,7 +175,7 @@ def _table(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArr
 
 
 def _write(table: Mapping[str, FloatArray], path: Path) -> None:
-    """Write CSV or Parquet; what is not finite is an empty cell."""
+    """Write CSV or Parquet; values that are not finite are empty cells."""
     from valveflow_ros.interface.files import whole_file
 
     def cell(value: float) -> float | None:
@@ -224,7 +224,7 @@ def _text(made: Compensation, pressures: Sequence[float], tolerance: float, path
 
 
 def _pieces(made: Compensation, pressures: Sequence[float]) -> str:
-    """Return one line a piece."""
+    """Return one line per piece."""
     from valveflow_ros.report.words import decimals, plain
 
     rows = []
@@ -272,7 +272,7 @@ def _data(
             'table_mw': made.table_mw,
             'table_u': made.table_u,
             'tolerance_mw': tolerance,
-            # What is not exact enough is never written.
+            # An inaccurate table is never written.
             'passed': True,
         },
         'notes': list(made.notes),
@@ -280,7 +280,7 @@ def _data(
 
 
 def _full_words(made: Compensation, pressures: Sequence[float]) -> list[str]:
-    """Return a line for each pressure at which the valve is fully open before the table ends."""
+    """Return a line for each pressure at which the valve is fully open within the table."""
     from valveflow_ros.report.words import decimals
 
     return [
@@ -297,7 +297,7 @@ def _full_words(made: Compensation, pressures: Sequence[float]) -> list[str]:
 def _full(made: Compensation, pressure: float) -> float | None:
     """Return the power at which the valve is fully open.
 
-    None if that is beyond the last row; NaN if it is before the first, where nothing is known.
+    None if it is above the last row; NaN if it is below the first row, where it is unknown.
     """
     u = _full_u(made, pressure)
     if u > made.u[-1]:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow completion``: let the shell finish what one begins to type."""
+"""``valveflow completion``: completion of the command line in the shell."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Print the script, which calls the command itself at each Tab."""
+    """Print the script, which calls the command at each Tab."""
     from argcomplete.shell_integration import shellcode
 
     text = shellcode(['valveflow'], True, options.shell)
@@ -41,12 +41,12 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def complete(verbs: list[tuple[str, str]], parser_of: Callable[[str], ArgumentParser]) -> None:
-    """Answer the shell, which calls the command with what was typed so far, and exit.
+    """Answer a completion request of the shell for the words typed so far, and exit.
 
     Parameters
     ----------
     verbs : list of (str, str)
-        Names, and what they do.
+        Names and descriptions.
     parser_of : callable
         Returns the parser of a verb.
     """
@@ -58,7 +58,7 @@ def complete(verbs: list[tuple[str, str]], parser_of: Callable[[str], ArgumentPa
     whole.add_argument('--version', action='store_true')
     below: Any = whole.add_subparsers()
     for name, about in verbs:
-        # Only the verb that is typed is loaded.
+        # Only the selected verb is loaded.
         if name not in typed[1:2]:
             below.add_parser(name, help=about)
             continue

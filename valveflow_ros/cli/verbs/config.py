@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow config``: a parameter file for the monitor, fitted to a log, or checked."""
+"""``valveflow config``: make a parameter file for the monitor from a log, or check one."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _checked(file: Path) -> VerbResult:
-    """Read a parameter file as the monitor would, and say what it changes."""
+    """Read a parameter file as the monitor would, and return its changes."""
     from valveflow_ros.interface.settings import read_parameters
     from valveflow_ros.parameters import PARAMETERS, Settings
 

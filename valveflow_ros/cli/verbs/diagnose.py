@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow diagnose``: what the simulation gets wrong, the cause, the gain."""
+"""``valveflow diagnose``: errors of the simulation, their cause, and the gain of a new model."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Open, diagnose, write."""
+    """Open the log, diagnose, write."""
     mapping = mapping_of(options)
     covariates = _covariates(options.covariate)
     console(0.0, 'starting')

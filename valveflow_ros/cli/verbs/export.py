@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow export``: a log becomes a table."""
+"""``valveflow export``: convert a log to a table."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Align and write."""
+    """Align the log and write the table."""
     mapping = mapping_of(options)
     if options.outputs:
         return _outputs(options, console)
@@ -78,7 +78,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         f'{moment(last)}, to {options.output}.\n{rejected_words(counts)}'
     )
     if log.output_unit != 'MW':
-        # The columns of the contract have no place for another unit.
+        # The specified columns have fixed units.
         told_by = f'--column generated_power=generated_power_mw:{log.output_unit}'
         text += f'\nThe table does not say that its flow is in {log.output_unit}: add {told_by}.'
     data = {
@@ -93,7 +93,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _outputs(options: Namespace, console: Console) -> VerbResult:
-    """Write what the monitor said."""
+    """Write the messages of the monitor."""
     from valveflow_ros.interface.files import TABLES, check_output, write_outputs
     from valveflow_ros.logs import open_log
     from valveflow_ros.report.words import counted

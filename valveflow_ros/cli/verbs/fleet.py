@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow fleet``: many units and months at once."""
+"""``valveflow fleet``: analyse many units and months."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ _NOT_JUDGED = 'No unit can be judged yet: a change needs two logs with a curve.'
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Read what there is to do, do it, tell the outcome."""
+    """Read the list of tasks, run them, report the outcome."""
     console(0.0, 'starting')
     from valveflow_ros.interface.fleets.fleet import fleet
     from valveflow_ros.report.words import counted, signed

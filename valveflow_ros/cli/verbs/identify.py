@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow identify``: the flow characteristic of a log."""
+"""``valveflow identify``: identify the flow characteristic from a log."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Open, identify, write."""
+    """Open the log, identify, write."""
     mapping = mapping_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.identify import identify
@@ -82,7 +82,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     given = checked_parameters(options)
     reference = load_characteristic(options.reference) if options.reference else None
     model = None
-    # A file of the node's parameters may name a model too.
+    # A parameter file of the node may contain a model too.
     if named := options.model or given.get('model_file'):
         path = Path(str(named)).expanduser()
         if options.step_test:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow import``: a historian's table becomes a log."""
+"""``valveflow import``: convert the table of a historian to a log."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ and with columns whose names say nothing:
 _OPCUA = 'opcua://'
 _HEAD = ('your column', 'is', 'why', 'in', 'runs from', '', '')
 _FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
-# Of these the table shows that one is needed, and not which.
+# The table shows that one of these is needed, but not which one.
 _CHOICES = ('time-zone', 'date-order', 'decimal', 'sheet')
 
 
@@ -82,7 +82,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Read, convert, write, and say what was understood."""
+    """Read, convert, write, and report how the table was interpreted."""
     if isinstance(options.table, str):
         return _from_history(options, console)
     mapping = mapping_of(options)
@@ -200,7 +200,7 @@ def _written(options: Namespace, table: TableImport) -> Path:
 
 
 def _understood(table: TableImport) -> list[str]:
-    """Return what a person should check before trusting the log."""
+    """Return the assumptions that a person should check before using the log."""
     from valveflow_ros.report.words import count, counted, duration, moment, plain
     from valveflow_ros.signals.units import DIFFERENCES
 
@@ -253,7 +253,7 @@ def _understood(table: TableImport) -> list[str]:
 
 
 def _refusal(refused: RefusedError, options: Namespace) -> str:
-    """Return what is open, and below it the whole command with everything said."""
+    """Return the open questions, followed by a complete command with the missing options."""
     from valveflow_ros.logs.tables.refusal import THEIRS
 
     if not refused.remedies:
@@ -268,7 +268,7 @@ def _refusal(refused: RefusedError, options: Namespace) -> str:
 
 
 def _command(refused: RefusedError, options: Namespace) -> str:
-    """Return the command as it was given, with the options that were missing."""
+    """Return the given command with the missing options added."""
     from valveflow_ros.logs.tables.refusal import Remedy
 
     given = [
@@ -288,7 +288,7 @@ def _command(refused: RefusedError, options: Namespace) -> str:
 
 
 def _quoted(path: Path) -> str:
-    """Return a path as a shell takes it, and as no option."""
+    """Return a path quoted for a shell, which cannot be mistaken for an option."""
     from valveflow_ros.logs.tables.refusal import quoted
 
     told = str(path)
@@ -296,7 +296,7 @@ def _quoted(path: Path) -> str:
 
 
 def _subject(remedy: Remedy) -> str:
-    """Return what an option speaks of, whichever of a signal's names was used."""
+    """Return the subject of an option, for any of the names of a signal."""
     from valveflow_ros.interface.mapping import read_mapping, subject
 
     if remedy.option == 'column':

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow info``: what is in a log."""
+"""``valveflow info``: describe the content of a log."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from valveflow_ros.parameters import Settings
     from valveflow_ros.records import Readings, Signal
 
-_LARGE_BYTES = 20_000_000  # a smaller file is read before anybody has to wait
+_LARGE_BYTES = 20_000_000  # smaller files are read without noticeable delay
 _GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 
 _DESCRIPTION = """\
@@ -44,7 +44,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Read and describe."""
+    """Read the log and describe it."""
     mapping = mapping_of(options)
     console(0.1, 'reading')
     if not options.json and (told := _summary(options.log)):
@@ -56,7 +56,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     parts = log.recorded.by_signal()
     steps = steps_of(parts)
     compression = log.compression
-    # A value of a compressed log stands for long without being a gap or a jump of the clock.
+    # A value of a compressed log may be valid for long, without a gap or a jump of the clock.
     stands_s = (
         compression.longest_s if compression is not None and log.updates is not None else 0.0
     )
@@ -154,7 +154,7 @@ def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
 
 
 def _summary(path: Path) -> str:
-    """Return a sentence from the summary of a large finished recording, else nothing."""
+    """Return a sentence from the summary of a large complete recording; '' otherwise."""
     from valveflow_ros.logs.mcap.records import read_summary
     from valveflow_ros.logs.source import Source
     from valveflow_ros.report.words import count, duration, moment
@@ -165,7 +165,7 @@ def _summary(path: Path) -> str:
         with Source.open(path) as source:
             summary = read_summary(source) if source.size >= _LARGE_BYTES else None
     except RecordingError:
-        # Reading the file will show what is wrong with it.
+        # Reading the file will show the error.
         return ''
     if summary is None or not summary.messages:
         return ''
@@ -182,7 +182,7 @@ def _fates(
 ) -> dict[str, dict[str, int]]:
     """Return how many readings of each signal are accepted or rejected, by reason.
 
-    Where it can be seen at once that nothing is wrong, the engine is not loaded.
+    If a quick check finds no problem, the engine is not loaded.
     """
     from valveflow_ros.records import SIGNALS
 
@@ -201,7 +201,7 @@ def _fates(
 
 
 def _in_order(readings: Readings, parts: dict[int, Readings], settings: Settings) -> bool:
-    """Return whether every reading is plausible and in order, so that none can be rejected."""
+    """Return True if every reading is plausible and in order, so that none can be rejected."""
     import numpy as np
 
     from valveflow_ros.interface.plausibility import limits
@@ -217,7 +217,7 @@ def _in_order(readings: Readings, parts: dict[int, Readings], settings: Settings
         return False
     for signal, part in parts.items():
         low, high = limits(Signal(signal), settings)
-        # Comparisons with NaN are false, so NaN is out of order too.
+        # Comparisons with NaN are false, so NaN counts as out of order.
         plausible = part.value.min() >= low and part.value.max() <= high
         if not (plausible and (np.diff(part.time_ns) > 0).all()):
             return False
@@ -227,7 +227,7 @@ def _in_order(readings: Readings, parts: dict[int, Readings], settings: Settings
 def _facts(
     log: Log, signal: Signal, part: Readings, step_s: float, stands_s: float
 ) -> dict[str, Any]:
-    """Return what there is to say of one signal, in the engine's unit."""
+    """Return the description of one signal, in the unit of the engine."""
     import numpy as np
 
     from valveflow_ros.records import SIGNALS

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow loop``: one control loop, judged from its command and what follows it."""
+"""``valveflow loop``: judge the valve of one control loop from its command and response."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Read, judge, write."""
+    """Read the table, judge, write."""
     from valveflow_ros.interface.loop import judge_loop
     from valveflow_ros.interface.mapping import table_options
 

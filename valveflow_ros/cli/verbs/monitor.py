@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow monitor``: what the monitor would have told over a log."""
+"""``valveflow monitor``: run the monitor on a log."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Open, monitor, write."""
+    """Open the log, run the monitor, write."""
     mapping = mapping_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.logs import open_log

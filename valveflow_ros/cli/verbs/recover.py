@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow recover``: make a whole recording of what is left of one."""
+"""``valveflow recover``: make a complete recording from the remains of a damaged one."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Recover and say what was kept."""
+    """Recover the recording and report what was kept."""
     from valveflow_ros.interface.files import check_output
     from valveflow_ros.logs.mcap.recover import recover
     from valveflow_ros.report.words import count, counted

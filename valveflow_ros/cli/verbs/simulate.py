@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow simulate``: the paper's plant or another one, with effects."""
+"""``valveflow simulate``: simulate the plant of the paper or another one, with effects."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Simulate and write."""
+    """Simulate and write the log."""
     if options.effects:
         return _catalogue(options.unit)
     if options.output is None:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow validate``: does a characteristic hold on other days."""
+"""``valveflow validate``: check whether a characteristic is valid on other days."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Open, find segments and judge, write."""
+    """Open the log, find segments, judge, write."""
     mapping = mapping_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.compare import check_models, validate
@@ -77,7 +77,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         f'{data.model}, held against {data.source}:', *verdict_words(data), data.held,
         _pieces(data), _errors(data),
     )  # fmt: skip
-    # The segments stand in the file only.
+    # The segments are only written to the file.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
     return write_results(found, options, text, brief)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow watch``: look on while a monitor works."""
+"""``valveflow watch``: display the state of a running monitor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from valveflow_ros.page.server import check_installed, page_arguments
 from valveflow_ros.report.terminal.text import number, zone_argument
 
 _MODULE, _PAGE_MODULE = 'valveflow_ros.ros.watch_main', 'valveflow_ros.ros.page_main'
-# A day at a sample a second: what the page shows at most.
+# A day at one sample per second: the maximum that the page shows.
 _DAY = 86_400
 _TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx')
 
@@ -77,7 +77,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
-    """Watch until there is nothing more to see."""
+    """Watch until the recording ends or the user stops."""
     _check_together(options)
     if options.log is None:
         _watch_ros(options)
@@ -96,7 +96,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _check_together(options: Namespace) -> None:
-    """Refuse options that do not go together; raises `UsageError`."""
+    """Raise `UsageError` for options that exclude each other."""
     if options.page:
         asked = (options.ask, options.alarm)
         if options.once or options.json or any(option is not None for option in asked):
@@ -111,7 +111,7 @@ def _check_together(options: Namespace) -> None:
 
 
 def _page_of_log(options: Namespace, console: Console) -> VerbResult:
-    """Follow a recording on a page; Ctrl-C is the usual end."""
+    """Show a growing recording on a page; it usually ends with Ctrl-C."""
     from valveflow_ros.interface.recording_view import LogWatch
     from valveflow_ros.page.notices import Notices
     from valveflow_ros.page.server import PageServer
@@ -146,7 +146,7 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
                 notices.tell(unit.changes())
                 time.sleep(options.interval)
     except KeyboardInterrupt:
-        # How one stops looking.
+        # The usual end.
         return VerbResult('', {})
     finally:
         if server is not None:
@@ -155,7 +155,7 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
 
 
 def _watch_log(options: Namespace, console: Console) -> VerbResult:
-    """Follow a recording; Ctrl-C is the usual end."""
+    """Follow a growing recording; it usually ends with Ctrl-C."""
     from valveflow_ros.interface.recording_view import LogWatch
     from valveflow_ros.records import zone_of
     from valveflow_ros.report.terminal.screen import Screen
@@ -175,7 +175,7 @@ def _watch_log(options: Namespace, console: Console) -> VerbResult:
         try:
             while True:
                 for _ in watch.read():
-                    # A long recording takes a while to catch up with, and that is to be seen.
+                    # Reading a long recording takes time; show the progress.
                     if screen.in_place and time.monotonic() - drawn_s >= options.interval:
                         screen.show(watch.frame())
                         drawn_s = time.monotonic()
@@ -185,13 +185,13 @@ def _watch_log(options: Namespace, console: Console) -> VerbResult:
                     break
                 time.sleep(options.interval)
         except KeyboardInterrupt:
-            # How one stops looking.
+            # The usual end.
             return VerbResult('', {})
     return VerbResult('', {})
 
 
 def _watch_ros(options: Namespace) -> NoReturn:
-    """Become the process that listens over ROS."""
+    """Replace this process by the one that listens to ROS."""
     missing = [name for name in ('rclpy', 'valveflow_msgs') if find_spec(name) is None]
     if missing:
         raise DataError(
@@ -223,7 +223,7 @@ def _page_words(options: Namespace) -> list[str]:
 
 
 def _become(module: str, words: list[str]) -> NoReturn:
-    """Become the process of another module."""
+    """Replace this process by another module."""
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, '-m', module, *words])

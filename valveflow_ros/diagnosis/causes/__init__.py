@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The catalogue of causes, by family; every `Cause` at the top of a module here is one of them."""
+"""The catalogue of causes, by family; every module-level `Cause` here belongs to it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from valveflow_ros.diagnosis.cause import Cause
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.grids import Grids
 
-# What an operator does about each cause and each fault of a record, by its name.
+# The action an operator takes for each cause and each fault of a record, by name.
 TO_DO = {
     'backlash': (
         'Have the coupling between stem and plug, the lever and the feedback linkage looked at '
@@ -166,6 +166,6 @@ def catalogue() -> dict[str, Cause]:
 
 
 def causes_for(grids: Grids) -> dict[str, Cause]:
-    """Return the catalogue for the form of a record and a cause for each covariate, by name."""
+    """Return the catalogue for the form of a record plus one cause per covariate, by name."""
     own = {name: covariate_cause(about) for name, (about, _) in grids.covariates.items()}
     return {name: cause.on(grids.form) for name, cause in (catalogue() | own).items()}

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Causes that are a change in time: drifts, steps, intervals and the daily swing."""
+"""Causes that are changes in time: drifts, steps, intervals and the daily cycle."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from valveflow_ros.diagnosis.screening import GAIN, INPUT, OFFSET, Screening
 from valveflow_ros.errors import counted
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
-# What causes that live in time share.
+# Functions shared by the causes that change in time.
 
 TEN_DAYS_S = 10.0 * DAY_S
 
@@ -39,9 +39,9 @@ def drift_size(screening: Screening, carrier: int) -> float:
 
 
 def ramp(grids: Grids, time_s: FloatArray) -> FloatArray:
-    """Return a ramp that rises by 1 in ten days and is 0 in the middle of the record.
+    """Return a ramp in time that rises by 1 in ten days.
 
-    The curve is then the mean curve.
+    It is 0 in the middle of the record, so that the fitted curve is the mean curve.
     """
     return np.asarray((time_s - 0.5 * grids.reference.span_s) / TEN_DAYS_S)
 
@@ -49,19 +49,19 @@ def ramp(grids: Grids, time_s: FloatArray) -> FloatArray:
 def since(grids: Grids, t0_days: float) -> FloatArray:
     """Return a step of height 1 at an onset.
 
-    The curve is then that of before, whose pieces are straight; a mean of both would have the
-    knots of both, more than are fitted, and what is left of them would look like another cause.
+    The fitted curve is then the curve before the onset, with straight pieces. A mean of both
+    curves would need the breakpoints of both; the missing ones would look like another cause.
     """
     return np.where(grids.time_s >= t0_days * DAY_S, 1.0, 0.0)
 
 
 def a_day(grids: Grids) -> str:
-    """Say that a record is too short for what changes with time."""
+    """Return why a record is too short for changes with time; empty if it is not."""
     return _at_least(grids, 1.0)
 
 
 def three_days(grids: Grids) -> str:
-    """Say that a record is too short for what repeats daily."""
+    """Return why a record is too short for a daily cycle; empty if it is not."""
     return _at_least(grids, 3.0)
 
 
@@ -82,8 +82,8 @@ def change(share: float) -> str:
 def apply_gain_drift(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power per flow drifts.
 
-    Erosion and deposits behind the valve, a cycle that loses efficiency, or the scale of the
-    power transducer; from the four signals these are one thing.
+    Possible reasons: erosion and deposits after the valve, lower cycle efficiency, or the scale of
+    the power transducer. The four signals cannot distinguish them.
 
         x = F(u) (1 + g (t - middle) / 10 d)
     """
@@ -91,12 +91,12 @@ def apply_gain_drift(values: Values, grids: Grids, extra: Values) -> FloatArray:
 
 
 def gain_drift_starts(screening: Screening) -> Sequence[Start]:
-    """Regress on the power times a ramp in time."""
+    """Regress the residual on the power times a ramp in time."""
     return screening.best(GAIN_DRIFT, [(drift_size(screening, GAIN),)])
 
 
 def gain_drift_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'The power per flow drifts: {change(values["g"])} in ten days, at every load alike '
         '(wear, efficiency, or the scale of the power meter).'
@@ -117,7 +117,7 @@ GAIN_DRIFT = Cause(
 def apply_gain_step(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power per flow changes at one moment and stays changed.
 
-    Maintenance, another power meter, a heater or an extraction taken in or out for good.
+    Possible reasons: maintenance, a new power meter, a permanently switched heater or extraction.
 
         x = F(u) (1 + g),  t >= t0
     """
@@ -130,7 +130,7 @@ def gain_step_starts(screening: Screening) -> Sequence[Start]:
 
 
 def gain_step_sentence(values: SentenceValues) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'From {values.onset} the same flow gives {change(values["g"])} power, at every '
         'load alike (maintenance, power meter, a heater or extraction).'
@@ -151,10 +151,10 @@ GAIN_STEP = Cause(
 def apply_input_drift(
     u: FloatArray, values: Values, grids: Grids, model: RegionalModel
 ) -> FloatArray:
-    """The flow area that belongs to a reading of u drifts.
+    """The flow area at a given reading of u drifts.
 
-    The scale of the pressure transmitter, that of the position sensor, or wear of the seat;
-    from the four signals these are one thing.
+    Possible reasons: the scale of the pressure transmitter or of the position sensor, or wear of
+    the seat. The four signals cannot distinguish them.
 
         u_true = u (1 + g (t - middle) / 10 d)
     """
@@ -162,13 +162,13 @@ def apply_input_drift(
 
 
 def input_drift_starts(screening: Screening) -> Sequence[Start]:
-    """Regress on the input's effect times a ramp in time."""
+    """Regress the residual on the effect of the input times a ramp in time."""
     size = drift_size(screening, INPUT)
     return screening.best(INPUT_DRIFT, [(size,), (0.6 * size,)])
 
 
 def input_drift_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'The same reading of opening and pressure passes {change(values["g"])} steam after ten '
         'days (scale of the pressure or position transmitter, or wear of the seat).'
@@ -191,7 +191,7 @@ def apply_input_step(
 ) -> FloatArray:
     """The pressure or position transmitter is recalibrated.
 
-    From then on the same reading of u stands for another flow area.
+    After the onset the same reading of u corresponds to another flow area.
 
         u_true = u (1 + g),  t >= t0
     """
@@ -204,7 +204,7 @@ def input_step_starts(screening: Screening) -> Sequence[Start]:
 
 
 def input_step_sentence(values: SentenceValues) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'From {values.onset} the same reading of opening and pressure passes '
         f'{change(values["g"])} steam (a transmitter was recalibrated or failed partly).'
@@ -225,8 +225,8 @@ INPUT_STEP = Cause(
 def apply_output_offset_drift(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The zero of the power drifts.
 
-    The zero of the power transducer, or auxiliary load that comes and stays, adds the same
-    at any load.
+    Possible reasons: the zero of the power transducer, or a new permanent auxiliary load. The
+    change is the same at every load.
 
         y = G x + b (t - middle) / 10 d
     """
@@ -234,12 +234,12 @@ def apply_output_offset_drift(y: FloatArray, values: Values, grids: Grids) -> Fl
 
 
 def output_offset_drift_starts(screening: Screening) -> Sequence[Start]:
-    """Regress on a ramp in time."""
+    """Regress the residual on a ramp in time."""
     return screening.best(OUTPUT_OFFSET_DRIFT, [(drift_size(screening, OFFSET),)])
 
 
 def output_offset_drift_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     b = values['b_mw']
     return (
         f'The power drifts by {b:+.2g} MW in ten days, by the same at every load (zero of the '
@@ -266,18 +266,18 @@ _LEAST_SWITCHES = 2
 
 
 def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
-    """For hours at a time part of the steam or of the heat goes elsewhere.
+    """For hours at a time a part of the steam or heat is used elsewhere.
 
     An extraction or a feed water heater is in or out of service:
 
         x = F(u) (1 + g w(t)),  w = 0 or 1
 
-    w is not measured. It is taken as a path of two states that rarely switches, and found
-    by the method of Viterbi on sums over half hours.
+    w is not measured. It is modelled as a two-state path with few switches, found with the
+    Viterbi algorithm on sums over half hours.
     """
-    # Return the factor on x; ``extra`` holds the times of switches in seconds.
+    # Return the factor on x; ``extra`` holds the switching times in seconds.
     inside = np.searchsorted(np.asarray(extra), grids.time_s, side='right') % 2
-    # Counted from the record's mean, as a drift.
+    # Relative to the mean over the record, as for a drift.
     span = grids.reference.span_s
     edges = np.clip(np.append(np.asarray(extra), span if len(extra) % 2 else []), 0.0, span)
     share = float(np.sum(edges[1::2] - edges[::2])) / span
@@ -285,7 +285,7 @@ def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
 
 
 def intervals_starts(screening: Screening) -> Sequence[Start]:
-    """Alternate between the path and the size, from several sizes of both signs."""
+    """Alternate between estimating the path and the size, from several sizes of both signs."""
     tried = []
     for sign in (1.0, -1.0):
         for size in _FIRST_SIZES:
@@ -305,7 +305,7 @@ def _search(screening: Screening, size: float) -> Start | None:
             break
         _, found = screening.modulated([GAIN], path[None, :].astype(np.float64))
         size, share = float(found[0]), float(path.mean())
-    if path.mean() > 0.5:  # what is rarer is the event
+    if path.mean() > 0.5:  # the rarer state counts as the event
         path, size = (1 - path).astype(np.uint8), -size
     times = _switches(screening, path)
     return (
@@ -321,8 +321,8 @@ def _path(
     share: float,
     path: ByteArray,
 ) -> None:
-    """Write the cheapest path of the state for a size and the share of time it is on."""
-    # The curve has taken up the mean: outside, the level lies as far below as it must.
+    """Write the state path of least cost for a size and the fraction of time in state 1."""
+    # The curve already contains the mean effect, so the levels are relative to that mean.
     on, off = size * (1.0 - share), -size * share
     cost = (on * on - off * off) * own - 2.0 * (on - off) * toward
     kernels.viterbi(cost / (2.0 * screening.variance), _SWITCH_PENALTY, path)
@@ -334,9 +334,9 @@ def _switches(screening: Screening, path: ByteArray) -> Values:
 
 
 def infer(screening: Screening, active: Active, allowed: BoolArray) -> Values:
-    """Return the switches that the allowed sub-blocks show, for a size that is known.
+    """Return the switching times from the allowed sub-blocks, for a known size.
 
-    The screening is that of the model without this cause.
+    The screening belongs to the model without this cause.
     """
     own, toward = (np.where(allowed, x, 0.0) for x in screening.gain_by_sub())
     edges = np.asarray(active.extra)
@@ -348,7 +348,7 @@ def infer(screening: Screening, active: Active, allowed: BoolArray) -> Values:
 
 
 def intervals_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'For hours at a time the same flow gives {change(values["g"])} power: something is '
         'switched in and out (an extraction, a feed water heater).'
@@ -370,8 +370,8 @@ _HOUR_S = 3600.0
 def apply_diurnal(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """The power follows the time of day.
 
-    The pressure in the condenser follows the ambient air or the cooling water; auxiliary load
-    driven by the weather looks the same.
+    The condenser pressure follows the ambient air or the cooling water. Auxiliary load that
+    depends on the weather has the same effect.
 
         x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
     """
@@ -381,7 +381,7 @@ def apply_diurnal(values: Values, grids: Grids, extra: Values) -> FloatArray:
 
 
 def diurnal_starts(screening: Screening) -> Sequence[Start]:
-    """Regress on the power times a daily sine and cosine."""
+    """Regress the residual on the power times a daily sine and cosine."""
     angle = 2.0 * np.pi * screening.grids.clock_s(screening.grids.sub_middle_s) / DAY_S
     _, found = screening.modulated([GAIN, GAIN], np.stack([np.cos(angle), np.sin(angle)]))
     peak_h = float(np.mod(np.arctan2(found[1], found[0]) / (2.0 * np.pi) * 24.0, 24.0))
@@ -389,7 +389,7 @@ def diurnal_starts(screening: Screening) -> Sequence[Start]:
 
 
 def diurnal_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'The power swings by ±{100.0 * abs(values["a"]):.2g} % every day, highest at '
         f'{values["peak_h"] % 24.0:.1f} h UTC (condenser and cooling water follow the day).'

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the four signals do not hold: columns beside them that the power may follow."""
+"""Causes from columns other than the four signals: covariates that the power may follow."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.slow import covariate_gain
 from valveflow_ros.records import FloatArray
 
-LEAST_SLOW_GAIN = 12.0  # log-likelihood beside a slow wander of the power
+LEAST_SLOW_GAIN = 12.0  # least gain in log-likelihood over a model with a slow disturbance
 _STEP_MW = 0.1
 _MOST_SHARE = 0.5  # of the power, for one standard deviation
-_LEAST_SPREAD = 1e-6  # of the largest value: the last digits of a constant
+_LEAST_SPREAD = 1e-6  # of the largest value: rounding in the last digits of a constant
 
 
 def covariate_cause(about: Covariate) -> Cause:
-    """Return the cause that the power follows a covariate c.
+    """Return the cause "the power follows a covariate c".
 
     Condenser vacuum, ambient temperature, fuel and extraction change how much power the same
-    steam makes:
+    steam generates:
 
         x = F(u) (1 + (b (c - usual c) + a1 (L - 1) + a2 (L - 1)^2) / P),  L = load / P
 
-    with P the mean power of the record, so that b is in MW per unit of c at that power. The usual
-    c is that of the record at the same load: what of c is a function of the load (more steam, a
-    warmer condenser) is in the curve already. In a record of days it is known only as well as
-    chance parted weather and load; a1 and a2 are what the straight pieces of the curve cannot
-    take up of that error.
+    where P is the mean power of the record, so that b is in MW per unit of c at that power. The
+    usual c is that of the record at the same load: the part of c that depends on the load (more
+    steam, a warmer condenser) is already in the curve. In a record of a few days it is uncertain,
+    because weather and load may be correlated by chance; a1 and a2 absorb the part of that error
+    that the straight pieces of the curve cannot.
 
-    The covariates that matter vary over hours and days, as does whatever else the power follows
-    and nobody logged; two slow series look alike by chance. So b has to show beside a slow wander
-    of the power whose variance and time scale are free; see `slow.covariate_gain`.
+    Relevant covariates vary over hours and days, like other influences that were not logged, and
+    two slow series may correlate by chance. So b must improve a model that already has a slow
+    disturbance of the power with free variance and time scale; see `slow.covariate_gain`.
     """
     name, spread = about.name, max(about.spread, 1e-300)
     bend = _MOST_SHARE * about.power_mw

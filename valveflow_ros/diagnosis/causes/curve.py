@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Causes in the curve itself: a bend, and a valve that no longer takes part."""
+"""Causes in the curve itself: a bend, and a valve that no longer opens as before."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _WIDTHS = (0.06, 0.1, 0.16, 0.25)  # of the range of u
 def apply_curve_shape(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The curve has a bend that its straight pieces cannot follow.
 
-    Where one valve begins to open before the one before it is open, their overlap raises the
-    curve; too little of it leaves a dent. The bump is a raised cosine on top of F:
+    If a valve opens before the previous one is fully open, the overlap raises the curve; too
+    little overlap lowers it. The bump is a raised cosine added to F:
 
         x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
     """
@@ -47,7 +47,7 @@ def apply_curve_shape(u: FloatArray, values: Values, grids: Grids) -> FloatArray
 
 
 def curve_shape_starts(screening: Screening) -> Sequence[Start]:
-    """Try bumps of some widths everywhere on the curve; keep the best of each width."""
+    """Try bumps of several widths along the curve; keep the best positions and widths."""
     low, high = screening.hats[0], screening.hats[-1]
     found: list[Start] = []
     for share in _WIDTHS:
@@ -63,7 +63,7 @@ def curve_shape_starts(screening: Screening) -> Sequence[Start]:
 
 
 def _levels_under(base: RegionalModel, values: Values, scale: float) -> RegionalModel:
-    """Return the base with its levels lifted by the bump: regions then change at the same u."""
+    """Return the base with its levels raised by the bump: regions then change at the same u."""
     if not len(base.levels) or np.any(base.right <= base.left):
         return base
     x = scale * np.append(base.left, base.right[-1]) + base.offset
@@ -74,12 +74,12 @@ def _levels_under(base: RegionalModel, values: Values, scale: float) -> Regional
 
 
 def curve_shape_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return f'The curve has {_bend(values)} that straight pieces do not follow (overlap of valves).'
 
 
 def either_bend_sentence(one: dict[str, float], other: dict[str, float]) -> str:
-    """Say a bend that may be of either sign."""
+    """Return the sentence for a bend whose sign is uncertain."""
     return (
         'The curve has a bend that straight pieces do not follow (overlap of valves): '
         f'{_bend(one)} and {_bend(other)} explain the record about equally well.'
@@ -110,10 +110,10 @@ _NARROWEST = 5.0  # % MPa^m
 
 
 def apply_curve_step(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
-    """From one moment on, one of several valves no longer takes part.
+    """From some time on, one of several valves no longer opens as before.
 
-    The curve is the sum of valves that open one after the other. If one sticks, breaks its
-    stem, or the order is changed, its share is missing from where it should have opened:
+    The curve is the sum of valves that open one after the other. If one valve sticks, its stem
+    breaks, or the order is changed, its contribution is missing above its opening point:
 
         x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
     """
@@ -123,7 +123,7 @@ def apply_curve_step(u: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def curve_step_starts(screening: Screening) -> Sequence[Start]:
-    """Try shares between all pairs of places on the curve, at every half hour."""
+    """Try contributions between all pairs of points on the curve, at every half hour."""
     pairs = [(i, k) for i, k in itertools.combinations(range(HATS), 2) if i >= 1 and k <= HATS - 1]
     shapes = np.zeros((len(pairs), 3 + HATS))
     for row, (i, k) in enumerate(pairs):
@@ -140,8 +140,8 @@ def curve_step_starts(screening: Screening) -> Sequence[Start]:
 
 
 def curve_step_sentence(values: SentenceValues) -> str:
-    """Say it."""
-    full = max(values['u_from'], values['u_to'])  # at once where the one is not below the other
+    """Return the sentence for the operator."""
+    full = max(values['u_from'], values['u_to'])  # a step if u_from is not below u_to
     return (
         f'From {values.onset} the curve is {abs(values["s_mw"]):.2g} MW '
         f'{"lower" if values["s_mw"] < 0.0 else "higher"} above u = {full:.4g} and unchanged '

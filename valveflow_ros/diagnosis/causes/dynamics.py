@@ -32,9 +32,9 @@ _TRIED_FACTORS = (0.4, 0.7, 1.5, 2.5)
 
 
 def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
-    """Above a load the unit stores more steam and answers with other dynamics than the model's.
+    """Above a load the unit stores more steam and responds with other dynamics than the model.
 
-    The regional G_i of eq. (3): above ``level`` another time constant and another delay hold.
+    These are the regional G_i of eq. (3): above ``level`` another time constant and delay apply.
     """
     time_s, delay_s, level = values
     keep = model.levels < level
@@ -48,7 +48,7 @@ def apply_region_lag(model: RegionalModel, values: Values) -> RegionalModel:
 
 
 def region_lag_starts(screening: Screening) -> Sequence[Start]:
-    """Try other time constants above some loads, the model's own levels among them."""
+    """Try other time constants above several loads, including the levels of the model."""
     grids, base = screening.grids, screening.model.base
     used = grids.usable > 0
     x = base.static(grids.u[used][::10], grids.scale[used][::10])
@@ -64,7 +64,7 @@ def region_lag_starts(screening: Screening) -> Sequence[Start]:
 
 
 def region_lag_sentence(values: SentenceValues) -> str:
-    """Say it; a time that its error exceeds is not known."""
+    """Return the sentence; a time that is smaller than its error is reported as unknown."""
     time_s, delay_s = (
         'that is not known' if name in values.unsure else f'of {values[name]:.{digits}g} s'
         for name, digits in (('time_s', 3), ('delay_s', 2))
@@ -94,10 +94,10 @@ _REHEATER_TRIED = tuple((alpha, t) for alpha in (0.2, 0.4, 0.7) for t in (8.0, 2
 
 
 def apply_reheater(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
-    """Part of the power comes behind the reheater, which fills slowly.
+    """A part of the power is generated after the reheater, which fills slowly.
 
-    The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in front
-    of the reheater at once, the rest follows its filling.
+    The IEEE turbine models (IEEEG1, TGOV1) split the power: the fraction alpha is generated
+    before the reheater without delay; the rest follows the filling of the reheater.
 
         y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
     """
@@ -109,15 +109,15 @@ def apply_reheater(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def reheater_starts(screening: Screening) -> Sequence[Start]:
-    """Try shares and time constants, and fit one with the whole model on a quicker base.
+    """Try several fractions and time constants; also fit the whole model with a faster base.
 
-    The plain model took much of the lag for its own; its tangents do not lead out of that.
+    The lag of the plain model contains much of the reheater lag; linearised steps cannot leave it.
     """
     base = screening.model.base
     alpha, time_s = _SLOW
     less = _SWALLOWED * (1.0 - alpha) * time_s
     quicker = np.maximum(base.time_constants - less, _SHORTEST * base.time_constants)
-    # Or all that is late is the reheater's, as in a unit whose valve and chest are quick.
+    # Or the reheater causes the whole lag, as in a unit with a fast valve and steam chest.
     whole = float(np.median(base.time_constants + base.delays)) / (1.0 - alpha)
     quick = np.full(base.regions, max(_QUICK * whole, screening.grids.step_s))
     fitted = [
@@ -134,7 +134,7 @@ def reheater_starts(screening: Screening) -> Sequence[Start]:
 
 
 def _fitted(screening: Screening, values: Values, base: RegionalModel) -> Start:
-    """Return a reheater fitted with the whole model, from these values on that base."""
+    """Return a reheater fitted with the whole model, from these initial values on that base."""
     task, model = screening.task, replace(screening.model, base=base)
     model, cost = improve(task, model.with_cause(Active(REHEATER, values)), _STEPS)
     gain = (task.cost(screening.model) - cost) / (2.0 * screening.variance)
@@ -142,7 +142,7 @@ def _fitted(screening: Screening, values: Values, base: RegionalModel) -> Start:
 
 
 def reheater_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'Only {100.0 * values["alpha"]:.0f} % of the power follow the valve at once; the rest '
         f'comes {values["time_s"]:.3g} s later, through the reheater.'
@@ -152,9 +152,9 @@ def reheater_sentence(values: dict[str, float]) -> str:
 REHEATER = Cause(
     'reheater', 'lag', Stage.OUTPUT,
     (
-        # The same delayed area (1 - alpha) T looks nearly the same: no ellipse holds them.
+        # Values with equal (1 - alpha) T look nearly the same, so a normal interval is too narrow.
         Unknown('alpha', '', 0.03, 0.0, 1.0, Kind.ROUGH),
-        # One fills within seconds to a minute; a memory of hours is another thing.
+        # A reheater fills within seconds to a minute; a memory of hours has another reason.
         Unknown('time_s', 's', 1.0, 0.5, 300.0, Kind.ROUGH),
     ),
     apply_reheater, reheater_starts, reheater_sentence, ('clock', 'region_lag', 'rate_limit'),
@@ -164,19 +164,19 @@ REHEATER = Cause(
 )  # fmt: skip
 
 
-# Between valve and generator little more than the filling of a chest: 3 to 10 s in the paper.
+# Between valve and generator only the steam chest must fill: 3 to 10 s in the paper.
 _LONGEST_DELAY_S = 15.0
 _TRIED_S = (3.0, 6.0, 10.0, 16.0, 25.0, 40.0)
 
 
 def apply_clock(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
-    """The power carries stamps of another clock, so that the answer comes before its cause.
+    """The power has time stamps of another clock, so that the response precedes its cause.
 
         y in the row of time t was measured at t + d,  d > 0
 
-    A power stamped too late is the same as a longer delay and cannot be told from it; of one
-    stamped too early only the part shows that the shortest delay does not hide: ``d_s`` is that
-    part, and its interval reaches higher by the longest delay a unit may have.
+    A power stamped too late is equivalent to a longer delay and cannot be detected. Of a power
+    stamped too early only the part beyond the shortest delay is visible: ``d_s`` is that part, and
+    the upper end of its interval is raised by the longest possible delay of a unit.
     """
     late = values[0] / grids.step_s
     whole = int(np.floor(late))
@@ -187,12 +187,12 @@ def apply_clock(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def clock_starts(screening: Screening) -> Sequence[Start]:
-    """Try some offsets."""
+    """Try several offsets."""
     return screening.best(CLOCK, [(d,) for d in _TRIED_S], keep=2)
 
 
 def clock_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'The power answers before the valve moves: its time stamps are at least '
         f'{values["d_s"]:.2g} s early against those of the opening.'

@@ -26,21 +26,21 @@ def apply_exponent(
 
         u_true = u (p / mean p)^dm
 
-    Under sliding pressure the curve takes up most of it: only the pressure's departure
-    from its line over the load tells. Where the breakpoints are at fixed openings it is the flow
-    itself that is multiplied.
+    With sliding pressure the curve absorbs most of this effect: only deviations of the pressure
+    from its line over the load show it. If the breakpoints are at fixed openings, the flow
+    itself is multiplied.
     """
     log = np.log(np.maximum(grids.pressure, 1e-6))
     return np.asarray(np.exp(values[0] * (log - grids.reference.log_pressure)))
 
 
 def exponent_starts(screening: Screening) -> Sequence[Start]:
-    """Try both signs: behind the regions a tangent understates it."""
+    """Try both signs: with regional dynamics, a linearised step underestimates the effect."""
     return screening.scaled(EXPONENT, (0.02,))
 
 
 def exponent_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     dm = values['dm']
     return (
         f'The flow follows the main steam pressure with an exponent that is {abs(dm):.2g} '
@@ -49,7 +49,7 @@ def exponent_sentence(values: dict[str, float]) -> str:
 
 
 def hindered(grids: Grids) -> str:
-    """Say that the pressure does not change."""
+    """Return that the pressure does not change; empty if it does."""
     spread = float(np.std(grids.pressure)) / max(float(grids.pressure.mean()), 1e-9)
     return '' if spread >= 1e-3 else 'the main steam pressure hardly changes'
 
@@ -79,16 +79,16 @@ def _flow(u: FloatArray, scale: FloatArray, model: RegionalModel) -> FloatArray:
 
 
 def apply_choked(u: FloatArray, values: Values, grids: Grids, model: RegionalModel) -> FloatArray:
-    """Flow that is not choked: the pressure behind the valve throttles it.
+    """The flow is not choked: the pressure downstream of the valve reduces it.
 
-    Above the critical ratio r_c of pressures (0.546 for superheated steam) the flow follows an
-    ellipse, psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2); the pressure behind the valve is
-    proportional to the flow (Stodola), r = kappa x / p. The curve holds the usual psi on the
-    line p_s(x) of sliding pressure already, so what shows is
+    Above the critical pressure ratio r_c (0.546 for superheated steam) the flow follows an
+    ellipse, psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2). The pressure downstream of the valve is
+    proportional to the flow (Stodola), r = kappa x / p. The curve already contains the psi on the
+    sliding pressure line p_s(x), so the remaining effect is
 
         u_true = u psi(kappa F(u) / p) / psi(kappa F(u) / p_s(F(u)))
 
-    IEC 60534 says the same of control valves with an expansion factor.
+    IEC 60534 describes the same effect for control valves with an expansion factor.
     """
     x = _flow(u, grids.scale, model)
     p = np.maximum(grids.pressure, 1e-6)
@@ -109,7 +109,7 @@ def choked_starts(screening: Screening) -> Sequence[Start]:
 
 
 def choked_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         'At high load the flow through the valve is not choked: the pressure behind it, about '
         f'{values["kappa"]:.3g} MPa for every MW, throttles the flow.'
@@ -129,11 +129,11 @@ _LEAST_SPREAD_K = 0.1
 
 
 def apply_temperature(values: Values, grids: Grids, extra: Values) -> FloatArray:
-    """Main steam temperature, which the paper holds constant.
+    """The main steam temperature changes; the paper assumes it constant.
 
-    A turbine swallows m ~ p / sqrt(T_K) (the cone law of Stodola and Fluegel): the hotter
-    the steam the less mass passes, about -0.062 %/K near 539 degC, while the enthalpy drop
-    grows. What remains is a few hundredths of a per cent of the power per kelvin.
+    The mass flow of a turbine is m ~ p / sqrt(T_K) (cone law of Stodola and Fluegel): hotter
+    steam gives less mass flow, about -0.062 %/K near 539 degC, but a larger enthalpy drop.
+    The net effect is a few hundredths of a per cent of the power per kelvin.
 
         x = F(u) (1 + k (T - mean T))
     """
@@ -141,12 +141,12 @@ def apply_temperature(values: Values, grids: Grids, extra: Values) -> FloatArray
 
 
 def temperature_starts(screening: Screening) -> Sequence[Start]:
-    """Try the slope of the residual against T."""
+    """Try the slope of the residual over T."""
     return screening.scaled(TEMPERATURE, (2e-4,))
 
 
 def temperature_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     k = 100.0 * values['k']
     return (
         f'The power {"rises" if k > 0.0 else "falls"} by {abs(k):.2g} % for every kelvin that '
@@ -155,7 +155,7 @@ def temperature_sentence(values: dict[str, float]) -> str:
 
 
 def temperature_hindered(grids: Grids) -> str:
-    """Say that the temperature does not change."""
+    """Return that the temperature does not change; empty if it does."""
     spread = float(np.std(grids.temperature))
     if spread >= _LEAST_SPREAD_K:
         return ''

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Causes between the measured and the true position of the valve: slack, friction, servo, stop."""
+"""Causes between the measured and the true valve position: backlash, friction, servo, limit."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ _BACKLASH_TRIED = (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.7, 4.5)
 def apply_backlash(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """A loose linkage between the position sensor and the plug.
 
-    The plug follows only when one flank of the slack pushes it (the play operator); the loop
-    this draws is as wide at any speed, unlike that of a lag.
+    The plug moves only when one end of the backlash gap pushes it (the play operator). The width
+    of the hysteresis loop does not depend on the speed, unlike that of a lag.
 
         plug = min(max(plug before, V - w / 2), V + w / 2)
     """
-    # Return the position of the plug; V is taken as it is, filtering would narrow the loop.
+    # Return the plug position; V is not filtered, because filtering would narrow the loop.
     out = np.empty(len(v))
     kernels.play(v, 0.5 * values[0], out)
     return out
 
 
 def backlash_starts(screening: Screening) -> Sequence[Start]:
-    """Try some widths."""
+    """Try several widths."""
     return screening.best(BACKLASH, [(w,) for w in _BACKLASH_TRIED])
 
 
 def backlash_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         'There is backlash between the position sensor and the plug: at each reversal the plug '
         f'stays still for the first {values["w_percent"]:.2g} % of opening.'
@@ -74,7 +74,7 @@ def _noise(v: FloatArray, grids: Grids) -> FloatArray:
 
 
 def draw(number: int) -> Callable[[FloatArray, Values, Grids], FloatArray]:
-    """Return what acts in one draw of the noise."""
+    """Return the ``act`` function of one noise realisation."""
 
     def path(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
         out = np.empty(len(v))
@@ -88,10 +88,10 @@ def draw(number: int) -> Callable[[FloatArray, Values, Grids], FloatArray]:
 def apply_stiction(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """Friction holds the valve until it slips.
 
-    The two-parameter picture of Choudhury in the form of He: the valve stays until the pull
-    exceeds (S + J) / 2, then slips and stays (S - J) / 2 behind. The moment it slips hangs on
-    every hundredth of a per cent of the measured opening, so several paths are run, each
-    with a draw of the sensor's noise (see `draws`).
+    This is the two-parameter model of Choudhury in the form of He: the valve stays until the
+    distance to the command exceeds (S + J) / 2, then slips to (S - J) / 2 from it. The time of a
+    slip depends on 0.01 % of measured opening, so several paths are simulated, each with another
+    realisation of the sensor noise (see `fitting.beliefs`).
     """
     total = np.zeros(len(v))
     for k in range(_DRAWS):
@@ -100,10 +100,10 @@ def apply_stiction(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def stiction_starts(screening: Screening) -> Sequence[Start]:
-    """Begin at the slack it looks like, then walk downhill: the path forgives little."""
+    """Start from the most similar backlash, then descend: the cost is sensitive to the path."""
     slack = screening.best(BACKLASH, [(s,) for s in _BANDS])
     if not slack or slack[0].gain < _LIKE_SLACK:
-        return []  # a valve that sticks looks loose first of all
+        return []  # stiction looks like backlash first of all
     (near,) = screening.best(BACKLASH, [(slack[0].values[0] * f,) for f in _FACTORS])
     rough = replace(STICTION, draws=_ROUGH_DRAWS)
     width = near.values[0]
@@ -114,7 +114,7 @@ def stiction_starts(screening: Screening) -> Sequence[Start]:
 
 
 def _downhill(screening: Screening, cause: Cause, best: Start, width: float) -> Start:
-    """Move where the valve breaks loose, (S + J)/2, and where it stops, (S - J)/2, in turn."""
+    """Adjust the slip threshold (S + J)/2 and the distance after a slip (S - J)/2 in turn."""
     for step in _STEPS:
         for by_band, by_jump in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
             while True:
@@ -130,12 +130,12 @@ def _downhill(screening: Screening, cause: Cause, best: Start, width: float) -> 
 
 
 def simpler(values: Values) -> list[Values]:
-    """Return values without a jump, which are a slack of about the same width."""
+    """Return values without a jump: a backlash of about the same width."""
     return [(values[0] * f, 0.0) for f in _SLACKS]
 
 
 def stiction_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'The valve sticks and slips: it stays until pulled by {values["s_percent"]:.2g} % of '
         f'opening and then jumps by {values["j_percent"]:.2g} %.'
@@ -151,7 +151,7 @@ STICTION = Cause(
     apply_stiction, stiction_starts, stiction_sentence, ('backlash',),
     'A slow ramp below 0.05 %/s, with the position logged to 0.01 %: slipping shows as stairs.',
     order=1, draws=_DRAWS, draw=draw, contains='backlash', simpler=simpler,
-    # The path of the plug is known roughly; where it is wrong the power lags and leads.
+    # The plug path is only roughly known; where it is wrong, the power lags or leads.
     conceals=('slack', 'lag'),
 )  # fmt: skip
 
@@ -162,8 +162,8 @@ _RATE_LIMIT_TRIED = (0.05, 0.08, 0.12, 0.18, 0.27, 0.4)
 def apply_rate_limit(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
     """The servo is slow.
 
-    Oil flow and pump bound the speed of the stem; a fast move takes the longer the larger it
-    is, a slow one is not affected.
+    Oil flow and pump limit the speed of the stem. The duration of a fast move grows with its
+    size; a slow move is not affected.
     """
     out = np.empty(len(v))
     kernels.rate_limit(v, values[0] * grids.fine_s, out)
@@ -171,12 +171,12 @@ def apply_rate_limit(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def rate_limit_starts(screening: Screening) -> Sequence[Start]:
-    """Try some speeds."""
+    """Try several speeds."""
     return screening.best(RATE_LIMIT, [(r,) for r in _RATE_LIMIT_TRIED])
 
 
 def rate_limit_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return (
         f'The plug cannot move faster than {values["r_percent_per_s"]:.2g} % of opening a second.'
     )
@@ -195,9 +195,9 @@ _TRIED_SHARES = (0.6, 0.7, 0.78, 0.85, 0.9, 0.94, 0.97, 0.99)
 
 
 def apply_saturation(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
-    """A stop keeps the valve from opening fully.
+    """A limit keeps the valve from opening fully.
 
-    A mechanical or a configured limit behind the position sensor:
+    It is a mechanical or configured limit downstream of the position sensor:
 
         V_true = min(V, V_max)
     """
@@ -205,13 +205,13 @@ def apply_saturation(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def saturation_starts(screening: Screening) -> Sequence[Start]:
-    """Try some places among the highest openings."""
+    """Try several values among the highest openings."""
     places = np.quantile(screening.grids.v[np.isfinite(screening.grids.v)], _TRIED_SHARES)
     return screening.best(SATURATION, [(float(p),) for p in places])
 
 
 def saturation_sentence(values: dict[str, float]) -> str:
-    """Say it."""
+    """Return the sentence for the operator."""
     return f'The plug does not open beyond {values["max_percent"]:.4g} %, whatever is measured.'
 
 

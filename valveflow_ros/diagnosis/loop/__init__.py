@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One control loop judged from its command and what follows it."""
+"""Diagnosis of the valve of one control loop, from its command and its response."""

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where the commanded opening was logged: faults between command and position sensor.
+"""Faults between command and position sensor, if the commanded opening was logged.
 
-They need no turbine. Each fault says where the valve goes from where it was measured to be,
-given the command; predicting one row ahead from the *measured* position keeps the path of a
-sticking valve from running away from the true one on a rounded command. A first-order servo
-and an offset of the sensor are no faults.
+They do not depend on the turbine. The model of each fault predicts the next position from the
+command and the *measured* position one row before. So the simulated path of a sticking valve
+cannot diverge from the true one if the command is rounded. A first-order servo and an offset of
+the sensor are not faults.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from valveflow_ros.diagnosis.evidence import sign_flip
 from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD, SUBS_IN_BLOCK, Grids
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
-# Sizes of a fault between command and position, from rows the sensor's noise cannot choose.
+# Sizes of a fault between command and position, without selection bias from the sensor noise.
 #
-# A fit of positions one row ahead finds which fault there is, but its sizes are pulled aside:
-# the noise of the reading a row before decides, together with the threshold, whether the valve
-# is taken to move, and stands in the prediction as well. Here rows are chosen by readings that
-# have no part in what is averaged over them.
+# The one-step prediction identifies the fault, but its sizes are biased: the noise of the previous
+# reading decides, together with the threshold, whether the valve is expected to move, and it also
+# enters the prediction. Here the rows are selected by readings that do not enter the averages
+# over these rows.
 
 Sizes = tuple[tuple[float, float, float], ...]  # value, low, high of each parameter
-_LEAST_SIZED_ROWS = 12  # of one direction
-_CLEAR = 3.0  # standard deviations of the reading that count as surely
-_SLIP = 3.5  # what half a jump must exceed, likewise
+_LEAST_SIZED_ROWS = 12  # per direction
+_CLEAR = 3.0  # standard deviations of the reading for a clear distance
+_SLIP = 3.5  # minimum of half a jump, in standard deviations of the reading
 _RUN = 4
-_MOVED_PERCENT = 0.015  # more than two readings rounded to 0.01 % can differ at rest
+_MOVED_PERCENT = 0.015  # larger than the difference at rest between two readings rounded to 0.01 %
 _ROUNDED = 0.003  # standard deviation of a rounded reading, in %
 _BINS = 300
 _Z95 = 1.96
@@ -43,22 +43,22 @@ def sized(
     name: str, c: FloatArray, v: FloatArray, step_s: float, values: tuple[float, ...],
     most_noise: float = np.inf,
 ) -> Sizes | None:  # fmt: skip
-    """Return sizes with 95 % intervals, None where too few rows tell them.
+    """Return sizes with 95 % intervals; None if there are too few suitable rows.
 
     Parameters
     ----------
     name : str
-        'stiction', 'backlash' or 'rate_limit'; others are left to the fit.
+        'stiction', 'backlash' or 'rate_limit'; None for other names.
     c, v : float64 (n,)
-        Command and measured position in %, one row after the other; NaN where missing.
+        Command and measured position in %, consecutive rows; NaN if missing.
     step_s : float
         Time between rows.
     values : tuple of float
-        The parameters as fitted: of stiction S and J, of backlash the width, of the rate limit
-        the rate.
+        The fitted parameters: S and J of stiction, the width of backlash, the rate of the rate
+        limit.
     most_noise : float
-        Standard deviation that the noise of a reading does not exceed: where the valve hardly
-        ever rests, the readings alone do not tell it.
+        Upper bound of the standard deviation of a reading: if the valve hardly ever rests, the
+        readings alone cannot give it.
     """
     ways: dict[str, Callable[..., Sizes | None]] = {
         'stiction': _stiction_size, 'backlash': _backlash_size, 'rate_limit': _rate_size,
@@ -69,7 +69,7 @@ def sized(
 
 
 def _noise(v: FloatArray) -> float:
-    """Return the noise of a reading from steps while nothing moves; a rounded 0.01 % at least."""
+    """Return the noise of a reading from steps at rest; at least 0.01 %, the rounding."""
     step = np.abs(np.diff(v))
     return max(float(np.nanmedian(step) / (0.6745 * np.sqrt(2.0))), 0.01)
 
@@ -77,7 +77,7 @@ def _noise(v: FloatArray) -> float:
 def _both_ways(
     choose: Callable[[float], BoolArray], distance: FloatArray
 ) -> tuple[float, float, float] | None:
-    """Return the mean distance upward and downward and the standard error of half their sum."""
+    """Return the mean distance upward and downward and the standard error of their mean."""
     found = []
     for sign in (1.0, -1.0):
         some = sign * distance[choose(sign)]
@@ -92,7 +92,7 @@ def _both_ways(
 def _rate_size(
     c: FloatArray, v: FloatArray, noise: float, step_s: float, values: tuple[float, ...]
 ) -> Sizes | None:
-    """Average steps where the command was out of reach already from two rows before."""
+    """Average the steps in rows where the command was already out of reach two rows before."""
     reach = 2.0 * values[0] * step_s + _CLEAR * noise
 
     def far(sign: float) -> BoolArray:
@@ -108,7 +108,7 @@ def _rate_size(
 def _backlash_size(
     c: FloatArray, v: FloatArray, noise: float, step_s: float, values: tuple[float, ...]
 ) -> Sizes | None:
-    """Average the distance where a flank pushed a row before and the command has gone further."""
+    """Average the distance in rows where the command pushed before and has moved further."""
     reach = 0.5 * values[0] + _CLEAR * noise
 
     def pushed(sign: float) -> BoolArray:
@@ -126,12 +126,12 @@ def _backlash_size(
 def _stiction_size(
     c: FloatArray, v: FloatArray, noise: float, step_s: float, values: tuple[float, ...]
 ) -> Sizes | None:
-    """Average where it slips to; find the pull at which it slips from slips and rests."""
+    """Average the distance after a slip; find the threshold from rows with and without slip."""
     off = 0.5 * (values[0] + values[1])
-    if 0.5 * values[1] < _SLIP * noise:  # a slip is not told from noise, which pulls the fit
+    if 0.5 * values[1] < _SLIP * noise:  # slips are hidden by noise, which biases the fit
         return tuple((x, x - 2.0 * noise, x + 2.0 * noise) for x in values)
     margin, offset, near, spread = _CLEAR * noise, 0.0, 0.0, 0.0
-    for _ in range(2):  # again with what the first time finds of the sensor's offset
+    for _ in range(2):  # repeat with the sensor offset found in the first pass
         free = c - offset
 
         def slips(sign: float, free: FloatArray = free) -> BoolArray:
@@ -154,9 +154,9 @@ def _stiction_size(
 def _threshold(
     c: FloatArray, v: FloatArray, moved: float, off: float
 ) -> tuple[float, float] | None:
-    """Return the pull at which the valve slips and the half width of its 95 % interval.
+    """Return the distance at which the valve slips and the half width of its 95 % interval.
 
-    The place it rests at is the mean of some rows without a slip. A slip is probit in the pull.
+    The rest position is the mean of several rows without slip. The slip probability is a probit.
     """
     step = np.abs(np.diff(v)) > moved
     n = len(v) - _RUN
@@ -176,7 +176,7 @@ def _threshold(
 
 
 def _probit(pull: FloatArray, slips: IntArray, rests: IntArray, off: float) -> tuple[float, float]:
-    """Return the pull at which half slip, and the half width of its profile's interval."""
+    """Return the distance with slip probability 0.5, and the half width of its interval."""
     centres = off * np.linspace(0.92, 1.08, 161)
     best = np.full(len(centres), -np.inf)
     for width in off * np.geomspace(0.003, 0.1, 9):
@@ -192,13 +192,13 @@ _LEAST_ROWS, _MOST_ROWS = 1000, 150_000
 _LEAST_GAIN = 30.0
 _PENALTY = 10.0
 _LEAST_SHARE = 0.05
-_SUBS = 80  # parts of a record that brings none
-_DEPENDENT = 10.0  # rows that count as one: what is left is not white
+_SUBS = 80  # number of parts of a record without given parts
+_DEPENDENT = 10.0  # number of rows that count as one, because the residual is correlated
 _TOP_PERCENT, _MOSTLY_AT_TOP = 0.3, 0.3
 _SHARES = (0.1, 0.05, 0.02, 0.008, 0.003, 0.001)
 
 Values = tuple[float, ...]
-# (command, position a row before, values, step in s) to the position predicted
+# (command, position one row before, values, step in s) -> predicted position
 Operator = Callable[[FloatArray, FloatArray, Values, float], FloatArray]
 
 
@@ -210,11 +210,11 @@ class ActuatorFault:
     ----------
     name : str
     parameters : dict
-        Value, low, high of each, 95 %.
+        Value, low, high of each, 95 % interval.
     rms_before, rms_after : float
-        Of position minus model on sealed blocks, in % of opening.
+        RMS of position minus model on sealed (test) blocks, in % of opening.
     p_value : float
-        Chance of such a gain there, as in `gain.sign_flip`.
+        p-value of the gain on these blocks, as in `evidence.sign_flip`.
     """
 
     name: str
@@ -226,7 +226,7 @@ class ActuatorFault:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """A fault to be tried: its name, parameters, operator and the sizes to begin with."""
+    """A fault to be fitted: its name, parameters, operator and initial sizes."""
 
     name: str
     keys: tuple[str, ...]
@@ -236,7 +236,7 @@ class _Plan:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """A fault with values and its mean squared misfit."""
+    """A fault with fitted values and its mean squared error."""
 
     plan: _Plan
     values: Values
@@ -244,7 +244,7 @@ class _Fit:
 
 
 def hindered(grids: Grids) -> str:
-    """Say why the actuator cannot be judged directly; empty if it can."""
+    """Return why the actuator cannot be judged directly; empty if it can."""
     both = np.isfinite(grids.command) & np.isfinite(grids.v)
     if not np.isfinite(grids.command).any():
         return 'the commanded opening was not logged'
@@ -281,7 +281,7 @@ def _stop(c: FloatArray, before: FloatArray, values: Values, step_s: float) -> F
 
 
 def _plans(c: FloatArray) -> list[_Plan]:
-    """Return every fault to be tried."""
+    """Return every fault to be fitted."""
     widths = np.geomspace(0.04, 8.0, 24).tolist()
     rates = np.geomspace(0.01, 3.0, 20).tolist()
     stops = np.quantile(c, (0.2, 0.3, 0.5, 0.7, 0.8, 0.88, 0.94, 0.98)).tolist()
@@ -297,7 +297,7 @@ def _plans(c: FloatArray) -> list[_Plan]:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Rows with command, position, and the position a row before."""
+    """Rows with command, position, and the position one row before."""
 
     c: FloatArray
     before: FloatArray
@@ -309,12 +309,12 @@ class _Pairs:
         return np.asarray(self.v - plan.operator(self.c, self.before, values, self.step_s))
 
     def cost(self, plan: _Plan, values: Values) -> float:
-        """Return the mean squared misfit."""
+        """Return the mean squared error."""
         rest = self.rest(plan, values)
         return float(rest @ rest) / max(len(rest), 1)
 
     def part(self, rows: BoolArray | slice) -> _Pairs:
-        """Return some of the rows."""
+        """Return a subset of the rows."""
         return _Pairs(self.c[rows], self.before[rows], self.v[rows], self.step_s)
 
 
@@ -338,17 +338,17 @@ def judge_rows(
     Parameters
     ----------
     command, position : float64 (n,)
-        In %, one row after the other; NaN where missing.
+        In %, consecutive rows; NaN if missing.
     step_s : float
         Time between rows.
     subs : int
-        Parts of the record whose scores are independent.
+        Number of parts of the record with independent scores.
     dependent : float
-        Rows that count as one.
+        Number of correlated rows that count as one.
     offset : float, optional
-        By how much the position reads more than the command, found from the rows by default. It
-        is given for a short record, in which the valve may hardly rest: the noise of a reading is
-        then bounded by what the fit leaves.
+        Position reading minus command at rest; estimated from the rows by default. It is given for
+        a short record, in which the valve may hardly rest: the noise of a reading is then bounded
+        by the residual of the fit.
     """
     both = np.isfinite(command[1:]) & np.isfinite(position[1:]) & np.isfinite(position[:-1])
     rests = offset is None
@@ -387,10 +387,10 @@ def judge_rows(
 
 
 def _offset(c: FloatArray, v: FloatArray) -> float:
-    """Return by how much the position reads more than the command: the median.
+    """Return the median of position minus command.
 
-    Where the valve stands at its highest much of the time, that may be a stop, and the lower
-    half of the commands tells it.
+    If the position is often at its maximum, that may be a stop; then only the lower half of the
+    commands is used.
     """
     at_top = float(np.mean(v > np.quantile(v, 0.999) - _TOP_PERCENT))
     asked = c <= np.median(c) if at_top > _MOSTLY_AT_TOP else slice(None)
@@ -398,7 +398,7 @@ def _offset(c: FloatArray, v: FloatArray) -> float:
 
 
 def _fitted(pairs: _Pairs, plan: _Plan) -> _Fit:
-    """Return the best values: the grid's best, then each moved in steps that shrink."""
+    """Return the best values: a grid search, then a coordinate search with decreasing steps."""
     best = min((_Fit(plan, v, pairs.cost(plan, v)) for v in plan.grid), key=lambda f: f.cost)
     for share in _SHARES:
         for k in range(len(best.values)):
@@ -416,7 +416,7 @@ def _fitted(pairs: _Pairs, plan: _Plan) -> _Fit:
 def _intervals(
     pairs: _Pairs, fit: _Fit, effective: float
 ) -> dict[str, tuple[float, float, float]]:
-    """Return where the profile falls by the 95 % point, walking out in growing steps."""
+    """Return profile likelihood intervals (95 %), found with growing steps."""
     most = fit.cost * np.exp(_CHI95 / effective)
     out = {}
     for k, key in enumerate(fit.plan.keys):

@@ -1,10 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The classical tests for a sticking valve in an oscillating loop, each as it was published.
+"""The classical tests for a sticking valve in an oscillating loop, as published.
 
-All of them take the controller's output (the command) and the process variable without missing
-rows. They ask different questions, and each can be asked of some loops only; `judge` says which,
-and combines the answers.
+All tests take the controller output (the command) and the process variable without missing
+rows. Each test applies to certain loops only; `judge` selects them and combines the results.
 """
 
 from __future__ import annotations
@@ -17,27 +16,27 @@ from valveflow_ros.records import FloatArray, IntArray
 
 STICTION, NO_STICTION, UNDECIDED = 'stiction', 'no stiction', 'undecided'
 
-# Horch's borders are phase shifts of a sinusoid of 30 and 60 degrees.
+# Horch's limits are phase shifts of a sinusoid of 30 and 60 degrees.
 _SHIFT = (1.0 / 3.0, 2.0 / 3.0)
 _HEIGHT = ((2.0 - np.sqrt(3.0)) / (2.0 + np.sqrt(3.0)), 1.0 / 3.0)
-_STICKY_TRAVEL = 0.25  # Yamashita's border
-_SHAPE = (0.4, 0.6)  # He's borders
+_STICKY_TRAVEL = 0.25  # Yamashita's limit
+_SHAPE = (0.4, 0.6)  # He's limits
 _LEAST_HALF_ROWS, _LEAST_HALVES = 5, 3
-_ROWS_A_PERIOD = 24  # to which a record is averaged before its direction of travel is read
+_ROWS_A_PERIOD = 24  # rows per period after averaging, before finding the direction of travel
 _CROSSINGS = 10
 _TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """What one test says.
+    """The result of one test.
 
     Attributes
     ----------
     answer : str
         `STICTION`, `NO_STICTION` or `UNDECIDED`.
     index : float
-        The number it stands on; NaN where it could not be formed.
+        The test statistic; NaN if it could not be computed.
     """
 
     answer: str
@@ -46,14 +45,14 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """How regularly a series swings.
+    """Period and regularity of the oscillation of a series.
 
     Attributes
     ----------
     period : float
-        Rows; NaN where the series does not swing.
+        In rows; NaN if the series does not oscillate.
     regularity : float
-        Above 1 the swing is regular.
+        Above 1 the oscillation is regular.
     """
 
     period: float
@@ -83,7 +82,7 @@ def oscillation(x: FloatArray) -> Oscillation:
     places = crossings(r[: max(3 * len(r) // 4, 2)], 0.02)[:_CROSSINGS]
     if len(places) < 2:
         return Oscillation(np.nan, 0.0)
-    # The first crossing is a quarter of a period away.
+    # The first crossing is at a quarter of a period.
     gaps = np.diff(places)
     period = 2.0 * float(gaps.mean())
     if len(gaps) < 3:
@@ -92,10 +91,10 @@ def oscillation(x: FloatArray) -> Oscillation:
 
 
 def crossings(x: FloatArray, band: float) -> FloatArray:
-    """Return where a series changes its sign, interpolated, if it goes beyond ``band`` between.
+    """Return interpolated sign changes of a series between values beyond ``band``.
 
-    Of several crossings with nothing beyond the band in between, the last of the series' way to
-    the other side counts.
+    If the series crosses zero several times without leaving the band, only the last crossing on
+    the way to the other side counts.
     """
     beyond = np.flatnonzero(np.abs(x) > band)
     sides = np.sign(x[beyond])
@@ -111,15 +110,15 @@ def crossings(x: FloatArray, band: float) -> FloatArray:
 
 
 def horch(u: FloatArray, y: FloatArray) -> Detection:
-    """Tell stiction from other causes by the phase between command and process variable.
+    """Detect stiction by the phase between command and process variable.
 
     A. Horch, "A simple method for detection of stiction in control valves", Control Engineering
-    Practice 7 (1999), with the decision regions of his thesis (KTH 2000). Around a
-    self-regulating process the cross-correlation is odd where the valve sticks and even where a
-    disturbance or a tight controller swings the loop. With tau_l and tau_r the distances from lag
-    0 to the first crossings, r0 the correlation at lag 0 and r_opt the extreme one between them:
+    Practice 7 (1999), with the decision regions of his thesis (KTH 2000). For a self-regulating
+    process the cross-correlation is odd if the valve sticks, and even if a disturbance or a tight
+    controller causes the oscillation. tau_l and tau_r are the distances from lag 0 to the first
+    crossings, r0 the correlation at lag 0 and r_opt the extreme one between them:
     shift = |tau_l - tau_r| / (tau_l + tau_r) and height = ||r0| - |r_opt|| / (|r0| + |r_opt|).
-    The index is the shift. On an integrating process the test says nothing.
+    The index is the shift. The test does not apply to an integrating process.
     """
     r = correlation(u, y)
     middle = len(u) - 1
@@ -139,7 +138,7 @@ def horch(u: FloatArray, y: FloatArray) -> Detection:
 
 
 def _first_crossing(side: FloatArray) -> float:
-    """Return the lag of the first change of sign, interpolated; NaN if there is none."""
+    """Return the lag of the first sign change, interpolated; NaN if there is none."""
     if abs(float(side[0])) < _TINY:
         return 0.0
     change = np.flatnonzero(np.sign(side[1:]) != np.sign(side[0]))
@@ -150,14 +149,14 @@ def _first_crossing(side: FloatArray) -> float:
 
 
 def yamashita(u: FloatArray, y: FloatArray, period: float) -> Detection:
-    """Tell stiction by how often the command travels while the flow behind it stands still.
+    """Detect stiction by how often the command moves while the flow does not.
 
     Y. Yamashita, "An automatic method for detection of valve stiction in process control loops",
-    Control Engineering Practice 14 (2006). Command and flow increase, stand or decrease from row
-    to row, by their normalised differences. The index is his rho_3: the share of moving rows in
-    which only the command moves, without runs that end as no sticking valve's do. We average the
-    rows to 24 a period first, so that the noise of a row decides no symbol. ``y`` is a flow; give
-    the differences of a level.
+    Control Engineering Practice 14 (2006). Command and flow increase, stay or decrease from row
+    to row, by their normalised differences. The index is his rho_3: the fraction of moving rows in
+    which only the command moves, without sequences that do not end like stiction. Unlike the
+    paper, rows are first averaged to 24 per period to reduce noise. ``y`` is a flow; for a level,
+    pass its differences.
     """
     group = max(1, int(period / _ROWS_A_PERIOD))
     n = len(u) // group * group
@@ -178,20 +177,20 @@ def yamashita(u: FloatArray, y: FloatArray, period: float) -> Detection:
 
 
 def _symbols(x: FloatArray) -> IntArray:
-    """Return 1, 0 or -1 for each difference beyond its standard deviation or not."""
+    """Return 1, 0 or -1 for each difference: above, within or below its standard deviation."""
     step = np.diff(x)
     z = (step - step.mean()) / max(float(step.std()), _TINY)
     return np.asarray(np.where(np.abs(z) > 1.0, np.sign(z), 0.0), dtype=np.int64)
 
 
 def he(x: FloatArray) -> Detection:
-    """Tell stiction by the shape of a swing: a triangle where the valve sticks, else a sine.
+    """Detect stiction by the shape of an oscillation: triangular with stiction, else sinusoidal.
 
     Q. P. He, J. Wang, M. Pottmann, S. J. Qin, "A curve fitting method for detecting valve stiction
-    in oscillating control loops", Ind. Eng. Chem. Res. 46 (2007). ``x`` is what comes first behind
-    the valve's jumps through an integrator: the command around a self-regulating process, the
-    process variable of an integrating one. Each half period is fitted by half a sine and by a
-    triangle with free peak; the index is MSE_sine / (MSE_sine + MSE_triangle).
+    in oscillating control loops", Ind. Eng. Chem. Res. 46 (2007). ``x`` is the first signal that
+    integrates the jumps of the valve: the command for a self-regulating process, the process
+    variable for an integrating one. Half a sine and a triangle with free peak are fitted to each
+    half period; the index is MSE_sine / (MSE_sine + MSE_triangle).
     """
     x = x - x.mean()
     x = x - _wander(x)
@@ -218,7 +217,7 @@ def he(x: FloatArray) -> Detection:
 
 
 def _wander(x: FloatArray) -> FloatArray:
-    """Return the mean over a period and a half around each row; zero where nothing swings."""
+    """Return the moving mean over one period; zero if there is no oscillation."""
     period = oscillation(x).period
     if not np.isfinite(period) or period > len(x) / 2:
         return np.zeros(len(x))
@@ -228,6 +227,6 @@ def _wander(x: FloatArray) -> FloatArray:
 
 
 def _misfit(piece: FloatArray, shape: FloatArray) -> float:
-    """Return what a shape of the best height leaves of a piece."""
+    """Return the squared error of a shape with the best height."""
     rest = piece - shape * float(piece @ shape) / float(shape @ shape)
     return float(rest @ rest)

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Judges the valve of one control loop: sticks, has slack, is sound, or cannot be judged.
+"""Judges the valve of one control loop: stiction, backlash, healthy, or not judged.
 
-First comes which question can be asked of a record, then what the tests answer. With a measured
-position the valve is judged between command and position (`actuator`). Without one, two
-likelihoods decide (`plug`), and the classical tests of a swinging loop (`detectors`) stand beside
-them: a valve is named on moderate evidence only where Horch's test does not say the contrary.
+First it checks which methods apply to the record. With a measured position, the valve is judged
+from command and position (`actuator`). Without one, two likelihoods decide (`plug`) together with
+the classical tests of an oscillating loop (`detectors`): with moderate evidence a fault is
+reported only if Horch's test does not contradict it.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ LEAST_ANSWER = 3.0
 """Log-likelihood by which the command must help to predict the response."""
 LEAST_PERIODS = 3.0
 _MOST_ROWS = 20_000
-_WINDOW_ROWS = 1000  # the thresholds were fixed on windows of 751
+_WINDOW_ROWS = 1000  # the thresholds were determined on windows of 751 rows
 _MOST_FILLED = 3
 _LEAST_LEVELS = 6
 _LEAST_STEP_S = 5.0
 _MOST_AT_STOP, _STOP_RUN = 0.03, 4
 _MOST_FLAT = 0.5
-_TURN = 0.2  # share of the command's usual span that counts as a way back
+_TURN = 0.2  # fraction of the usual span of the command that counts as a reversal
 _REGULAR = 1.0
 _MOST_LEFT = 4.0
 _LEAST_SLOPE = 0.3  # of the position over the command
-# Rows of a position that count as one: those of ten seconds, for a servo's rest is not white.
+# Rows of a position that count as one: ten seconds, because a servo residual is correlated.
 _DEPENDENT_S, _LEAST_DEPENDENT, _MOST_DEPENDENT = 10.0, 2.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class LoopJudgement:
-    """What a record says of the valve of its loop.
+    """The result for the valve of a loop.
 
     Attributes
     ----------
     verdict : str
-        Of `VERDICTS`.
+        One of `VERDICTS`.
     reason : str
         A sentence for an operator.
     sizes : dict
-        Value, low, high (95 %) and unit of each, where they can be told.
+        Value, low, high (95 %) and unit of each, if known.
     detections : dict
-        What each classical test says, where the loop swings regularly.
+        Result of each classical test, if the loop oscillates regularly.
     gain, travel : float
-        Log-likelihoods of the best plug, as in `plug.Evidence`; NaN where none was tried.
+        Log-likelihoods of the best plug, as in `plug.Evidence`; NaN if not computed.
     period_s : float
-        Of a regular swing, else NaN.
+        Period of a regular oscillation, else NaN.
     rows : int
-        That were judged.
+        Number of rows used.
     """
 
     verdict: str
@@ -82,28 +82,28 @@ class LoopJudgement:
 def judge_response(
     command: FloatArray, response: FloatArray, step_s: float, set_point: FloatArray | None = None
 ) -> LoopJudgement:
-    """Judge a valve from its command and a process variable behind it.
+    """Judge a valve from its command and a process variable that it controls.
 
     Parameters
     ----------
     command : float64 (n,)
-        Controller output in %, either sense; NaN where it is missing.
+        Controller output in %, either direction of action; NaN if missing.
     response : float64 (n,)
         Flow, level or pressure in any unit, in the same rows.
     step_s : float
-        Time between rows in s, which are equally far apart.
+        Constant time between rows in s.
     set_point : float64 (n,), optional
-        Where it swings with the loop, an oscillation comes from outside.
+        If it oscillates with the loop, the oscillation has an external source.
 
     Notes
     -----
-    A fault is called stiction, of which slack is the case without a jump: on simulated loops the
-    better fit of one or the other named fewer valves right than their frequency does. The reason
-    says which fits better.
+    A fault is called stiction; backlash is the case without a jump. On simulated loops, choosing
+    by the better fit classified fewer valves correctly than always choosing the more frequent one.
+    The reason says which of the two fits better.
 
-    Gaps of up to three rows are bridged; the longest stretch without others is judged. A long one
-    is judged in parts of at most 1000 rows, which decide by majority, for a misfit of the linear
-    process adds up with the rows as evidence of a fault does.
+    Gaps of up to three rows are interpolated; the longest stretch without larger gaps is used. A
+    long one is split into parts of at most 1000 rows, which decide by majority: the misfit of the
+    linear process model accumulates with the rows and looks like evidence of a fault.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def judge_response(
     parts = np.array_split(np.arange(len(c)), -(-len(c) // (_WINDOW_ROWS * group)))
     found = [_judged(c[p], y[p], None if aim is None else aim[p], step_s, group) for p in parts]
     if len(found) > 1 and all(one.verdict == NOT_JUDGED for one in found):
-        # Swings too slow for a part may show in all of it.
+        # Oscillations too slow for one part may be visible in the whole record.
         return _judged(c, y, aim, step_s, -(-len(c) // _WINDOW_ROWS))
     return found[0] if len(found) == 1 else _together(found)
 
@@ -129,7 +129,7 @@ def judge_response(
 def _judged(
     c: FloatArray, y: FloatArray, aim: FloatArray | None, step_s: float, group: int
 ) -> LoopJudgement:
-    """Judge rows without gaps, few enough that the thresholds hold."""
+    """Judge rows without gaps, few enough for the thresholds to be valid."""
     why = _hindered(c, y, 'process value')
     if why:
         return LoopJudgement(NOT_JUDGED, why, rows=len(c))
@@ -151,7 +151,7 @@ def _judged(
 
 
 def _together(parts: list[LoopJudgement]) -> LoopJudgement:
-    """Return what the parts of a long record say by majority, in the words of the clearest."""
+    """Return the majority result of the parts, with the reason of the clearest part."""
     rows = sum(one.rows for one in parts)
     decided = [one for one in parts if one.verdict != NOT_JUDGED]
     named = [one for one in decided if one.verdict in FAULTS]
@@ -171,7 +171,7 @@ def judge_position(command: FloatArray, position: FloatArray, step_s: float) -> 
     Parameters
     ----------
     command, position : float64 (n,)
-        In %, or the position as a fraction; either sense. NaN where missing.
+        In %, or the position as a fraction; either direction of action. NaN if missing.
     step_s : float
         Time between rows in s.
 
@@ -200,8 +200,8 @@ def judge_position(command: FloatArray, position: FloatArray, step_s: float) -> 
             rows=rows,
         )
     dependent = min(max(_DEPENDENT_S / step_s, _LEAST_DEPENDENT), _MOST_DEPENDENT)
-    # In a short record the middle between the ends of their difference is the offset; at a
-    # stop it is not, and the median is.
+    # In a short record the offset is the middle of the range of the difference; at a stop it is
+    # the median.
     middle = 0.5 * float(np.quantile((v - c)[both], (0.01, 0.99)).sum())
     tried = [
         actuator.judge_rows(c, v, step_s, dependent=dependent, offset=offset)
@@ -219,7 +219,7 @@ def judge_position(command: FloatArray, position: FloatArray, step_s: float) -> 
 
 
 def _beyond_servo(c: FloatArray, v: FloatArray) -> float:
-    """Return what a first-order servo leaves of the position, in noises of a reading."""
+    """Return the residual of a first-order servo, relative to the noise of a reading."""
     rows = np.flatnonzero(np.isfinite(v[1:]) & np.isfinite(v[:-1]) & np.isfinite(c[1:]))
     table = np.column_stack([v[rows], c[rows + 1], np.ones(len(rows))])
     rest = v[rows + 1] - table @ np.linalg.lstsq(table, v[rows + 1], rcond=None)[0]
@@ -273,13 +273,13 @@ def _checked(
 
 
 def _runs(good: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return where runs of true rows begin and end."""
+    """Return the start and end of runs of true rows."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], good.astype(np.int8), [0]))))
     return edges[::2].astype(np.int64), edges[1::2].astype(np.int64)
 
 
 def _bridged(x: FloatArray) -> FloatArray:
-    """Return a series with gaps of a few rows filled by straight lines."""
+    """Return a series with gaps of a few rows filled by linear interpolation."""
     known = np.isfinite(x)
     if known.all() or not known.any():
         return x
@@ -293,7 +293,7 @@ def _bridged(x: FloatArray) -> FloatArray:
 
 
 def _longest(good: BoolArray) -> slice:
-    """Return the longest run of rows that are all good; of a very long one the last rows."""
+    """Return the longest run of good rows; if it is very long, its last rows."""
     begins, ends = _runs(good)
     if not len(begins):
         return slice(0, 0)
@@ -331,7 +331,7 @@ def _hindered(c: FloatArray, y: FloatArray, what: str) -> str:
 
 
 def _at_stop(c: FloatArray, end: float) -> float:
-    """Return the share of rows in long rests at an end; a rounded command rests anywhere."""
+    """Return the fraction of rows in long rests at an end; 0 for a coarsely rounded command."""
     begins, ends = _runs(c == end)
     runs = ends - begins
     coarse = len(np.unique(c)) < len(c) // 10
@@ -339,7 +339,7 @@ def _at_stop(c: FloatArray, end: float) -> float:
 
 
 def _turns(c: FloatArray) -> int:
-    """Return how often the command turns round and goes a good way back."""
+    """Return how often the command reverses by more than a fraction of its range."""
     low, high = np.quantile(c, (0.01, 0.99))
     way, turns, extreme, up = _TURN * float(high - low), 0, float(c[0]), 0
     for value in c.tolist():
@@ -355,7 +355,7 @@ def _turns(c: FloatArray) -> int:
 
 
 def _asked(c: FloatArray, y: FloatArray, period: float, horch: Detection) -> dict[str, Detection]:
-    """Ask the classical tests."""
+    """Apply the classical tests."""
     return {
         'horch': horch,
         'yamashita': detectors.yamashita(c, y, period),
@@ -367,7 +367,7 @@ def _asked(c: FloatArray, y: FloatArray, period: float, horch: Detection) -> dic
 def _concluded(
     found: plug.Evidence, horch: Detection, turns: int, regular: bool
 ) -> tuple[str, str]:
-    """Return verdict and reason; the reason of an oscillation goes on from its period."""
+    """Return verdict and reason; for an oscillation the reason continues a sentence."""
     asked = CONTRADICTED_GAIN if horch.answer == NO_STICTION else LEAST_GAIN
     if found.gain >= asked or found.travel >= LEAST_TRAVEL:
         seen = (
@@ -402,7 +402,7 @@ def _concluded(
 
 
 def _swings_along(aim: FloatArray, period: float) -> bool:
-    """Tell whether the set point swings regularly with nearly the same period."""
+    """Return True if the set point oscillates regularly with nearly the same period."""
     if not np.isfinite(aim).all() or len(np.unique(aim)) < _LEAST_LEVELS:
         return False
     own = detectors.oscillation(aim)

@@ -1,17 +1,17 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a plug that sticks or has slack explains of a response, beside what the command does.
+"""The gain of a model with a sticking or slack plug in predicting a response.
 
-The response is predicted one row ahead from its own past and the command's (a linear process with
-free poles and delay), and with the past of a plug that follows the command with stick band S and
-slip jump J: the two-parameter stiction of He, Wang, Pottmann and Qin, Ind. Eng. Chem. Res. 46
-(2007); J = 0 is backlash. To fit such a Hammerstein model over a grid of S and J is the method of
-Jelali, J. Process Control 18 (2008).
+The response is predicted one row ahead from its own past and that of the command (a linear process
+with free poles and delay), and from the past of a plug that follows the command with stick band S
+and slip jump J: the two-parameter stiction model of He, Wang, Pottmann and Qin, Ind. Eng. Chem.
+Res. 46 (2007); J = 0 is backlash. Fitting such a Hammerstein model over a grid of S and J is the
+method of Jelali, J. Process Control 18 (2008).
 
-Ours are: only rows before the one predicted are used, because within a row the command already
-holds the response; the linear part remembers far back in means that grow longer with age, so that
-oscillations and loads that wander are predicted without a plug; the gain must stay without the
-stretch of the record that favours it most.
+Differences from these papers: only earlier rows are used, because within a row the command already
+depends on the response; the linear part uses means that grow longer with age, so that it predicts
+oscillations and slow load changes without a plug; the gain is computed without the part of
+the record that contributes most to it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from valveflow_ros.diagnosis.kernels import stick_slip
 from valveflow_ros.records import FloatArray
 
 Spans = tuple[tuple[int, int], ...]
-# Rows before the one predicted, first to last, whose mean is one regressor.
+# Each regressor is the mean over these rows, counted back from the predicted one.
 OWN: Spans = (
     (1, 1), (2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (9, 12), (13, 16), (17, 24), (25, 32),
 )  # fmt: skip
@@ -34,11 +34,11 @@ PLUG: Spans = COMMAND[:-1]
 MEMORY = 32
 _BLOCKS = 12
 _GAIN_REVERSALS, _TRAVEL_REVERSALS = 3, 1
-_TRAVEL_BAND = 0.2  # a plug with a smaller band hardly differs from the command
-_SHORTFALL = 0.2  # what counts against a plug that explains less than the command
-_BANDS = np.geomspace(0.04, 1.0, 24)  # shares of the command's span
-_JUMPS = (0.0, 0.3, 0.6, 0.8, 1.0)  # shares of the band
-_STARTS = (-0.8, 0.0, 0.8)  # shares of the pull at which the plug slips
+_TRAVEL_BAND = 0.2  # a plug with a smaller band is nearly equal to the command
+_SHORTFALL = 0.2  # weight of the penalty for a plug that explains less than the command
+_BANDS = np.geomspace(0.04, 1.0, 24)  # fractions of the span of the command
+_JUMPS = (0.0, 0.3, 0.6, 0.8, 1.0)  # fractions of the band
+_STARTS = (-0.8, 0.0, 0.8)  # fractions of the distance at which the plug slips
 _STEPS = (0.06, 0.02)
 CLEAR_JUMP_GAIN = 4.0
 """Log-likelihood by which sticking or slack must fit better than the other to be called better."""
@@ -47,17 +47,17 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """A plug that was tried; band and jump as shares of the command's span.
+    """A plug model that was tried; band and jump are fractions of the span of the command.
 
     Attributes
     ----------
     gain : float
-        Log-likelihood that it adds to the command's; 0 if it turns round fewer than three times,
-        for then it could be any single event.
+        Gain in log-likelihood over the model with the command only; 0 if the plug reverses
+        fewer than three times, because a single event could look the same.
     travel : float
-        Log-likelihood of its past less that of the command's, each beside the response's own:
-        positive where the response stands while the command travels. -inf for a plug that never
-        turns round or hardly differs from the command.
+        Log-likelihood with the past of the plug minus that with the past of the command, each
+        with the past of the response: positive if the response rests while the command moves.
+        -inf for a plug that never reverses or is nearly equal to the command.
     """
 
     gain: float
@@ -69,18 +69,18 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What the best plugs explain.
+    """The results of the best plug models.
 
     Attributes
     ----------
     gain, travel : float
         The largest ones, as in `Tried`.
     of_command : float
-        Log-likelihood by which the command's past helps to predict the response.
+        Gain in log-likelihood from the past of the command.
     band, jump : float
-        Of the plug that decides, in the command's unit.
+        Parameters of the selected plug, in the unit of the command.
     jump_gain : float
-        Log-likelihood of the best plug with a jump less that of the best without.
+        Log-likelihood of the best plug with a jump minus that of the best one without.
     """
 
     gain: float
@@ -92,7 +92,7 @@ class Evidence:
 
 
 def past(series: FloatArray, spans: Spans) -> FloatArray:
-    """Return means over past rows as columns, for every row that has all of its past."""
+    """Return means over past rows as columns, for every row with a complete past."""
     n = len(series)
     sums = np.concatenate(([0.0], np.cumsum(series)))
     out = np.empty((n - MEMORY, len(spans)), order='F')
@@ -103,19 +103,19 @@ def past(series: FloatArray, spans: Spans) -> FloatArray:
 
 
 class PlugScore:
-    """A loop in shares of the command's span, and how well it is predicted without a plug.
+    """A loop scaled by the span of the command, and its prediction without a plug.
 
     Parameters
     ----------
     command, response : float64 (n,)
         Without missing rows; both vary.
     group : int
-        Rows averaged to one, behind the plug.
+        Number of rows averaged to one, after the plug.
 
     Attributes
     ----------
     span : float
-        Highest minus lowest command.
+        Maximum minus minimum of the command.
     of_command : float
         As in `Evidence`.
     """
@@ -147,14 +147,14 @@ class PlugScore:
         return np.asarray(series[: n * self._group].reshape(n, self._group).mean(axis=1))
 
     def plug(self, band: float, jump: float, start: float) -> FloatArray:
-        """Return where a plug goes that begins ``start`` of its slip-off pull away."""
+        """Return the path of a plug that starts at ``start`` times its slip distance."""
         away = 0.5 * start * (band + jump)
         path = np.empty(len(self._command) + 1)
         stick_slip(np.concatenate(([self._command[0] + away], self._command)), band, jump, path)
         return path[1:]
 
     def tried(self, band: float, jump: float, start: float) -> Tried:
-        """Return what a plug explains."""
+        """Return the gain of a plug model."""
         path = self.plug(band, jump, start)
         moves = np.sign(np.diff(path))
         reversals = np.count_nonzero(np.diff(moves[moves != 0.0]))
@@ -178,7 +178,7 @@ class PlugScore:
         return Tried(gain, travel if band >= _TRAVEL_BAND else -np.inf, band, jump, start)
 
     def _kept(self, after: FloatArray) -> float:
-        """Return the gain in log-likelihood without the stretch that favours the plug most."""
+        """Return the log-likelihood gain without the part of the record that gains most."""
         squares = np.add.reduceat(after**2, self._edges)
         kept = np.argsort(self._before - squares)[:-1]
         ratio = max(float(self._before[kept].sum()), _TINY) / max(
@@ -188,19 +188,19 @@ class PlugScore:
 
 
 def evidence(command: FloatArray, response: FloatArray, group: int) -> Evidence:
-    """Return what plugs of any band and jump explain of a response.
+    """Return the best gain of plug models with any band and jump.
 
     Parameters
     ----------
     command, response : float64 (n,)
-        Without missing rows, in any unit and of either sense; both vary.
+        Without missing rows, in any unit and direction of action; both vary.
     group : int
-        Rows averaged to one, behind the plug.
+        Number of rows averaged to one, after the plug.
 
     Notes
     -----
-    Sizes from command and response alone are rough: what happens between rows is not seen, and the
-    top of a command's swing is missed, so that many sticking plugs are taken for slack.
+    Sizes from command and response alone are inaccurate: moves between rows and the extremes of
+    the command are not sampled, so that stiction is often classified as backlash.
     """
     loop = PlugScore(command, response, group)
     grid = [
@@ -223,7 +223,7 @@ def evidence(command: FloatArray, response: FloatArray, group: int) -> Evidence:
 
 
 def _moved(loop: PlugScore, best: Tried) -> Tried:
-    """Move a plug uphill in steps that shrink."""
+    """Increase the gain of a plug model by a search with decreasing steps."""
     for step in _STEPS:
         better = True
         while better:
@@ -236,7 +236,7 @@ def _moved(loop: PlugScore, best: Tried) -> Tried:
 
 
 def _beside(p: Tried, step: float) -> list[tuple[float, float, float]]:
-    """Return plugs a step of the band away, J kept within 0 and S."""
+    """Return plugs at a distance of ``step`` times the band, with J between 0 and S."""
     d = step * p.band
     bands = [b for b in (p.band - d, p.band + d) if b <= 1.0]
     jumps = [p.jump - d, p.jump + d] if p.jump else []

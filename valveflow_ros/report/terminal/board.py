@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a monitor decoded, and what a terminal view keeps of them."""
+"""Decoded messages of a monitor, and the part of them that a terminal view keeps."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ DIAGNOSIS = 'valveflow_msgs/msg/Diagnosis'
 HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
 MESSAGES = (CURVE, PREDICTION, ALARM, DIAGNOSIS)
 AGE = 'Age of the curve (s)'
-# A quarter of an hour at one sample a second: more than fits on any terminal.
+# 15 minutes at one sample per second: more than fits on any terminal.
 KEPT = 900
 
-# What a monitor tells on `/diagnostics` besides its inputs.
+# Items of `/diagnostics` other than inputs.
 _ITEMS = frozenset({
     'fit', 'alarm', 'reference', 'model', 'diagnosis', 'recorder', 'state', 'parameters', 'name',
 })  # fmt: skip
-# More alarms than a monitor has, and more items of health.
+# Upper limits, larger than the numbers of alarms and health items of a monitor.
 _MOST_ALARMS, _MOST_ITEMS = 64, 64
 
 Fields = Mapping[str, Any]
@@ -43,25 +43,25 @@ Fields = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ItemView:
-    """An item of the health with the numbers behind it, as text; units stand in their keys."""
+    """An item of the health with its values, as text; the keys contain the units."""
 
     health: HealthView
     values: Mapping[str, str]
 
 
 class Board:
-    """The state of a monitor as its messages tell it, in bounded memory.
+    """The state of a monitor according to its messages, with bounded memory.
 
-    Messages are taken as mappings from field to value, whatever brought them.
+    Messages are mappings from field to value, independent of their transport.
 
     Attributes
     ----------
     inputs : tuple of HealthView
-        Set by whoever knows better than `/diagnostics`.
+        Set by a caller that has a better source than `/diagnostics`.
     recorder : HealthView or None
-        The same.
+        The same for the recorder.
     items : tuple of ItemView
-        All that `/diagnostics` tells of this monitor.
+        All items of this monitor in `/diagnostics`.
     """
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class Board:
         self.recorder: HealthView | None = None
         self.items: tuple[ItemView, ...] = ()
         self._unit = ''
-        # The tag of what the monitor publishes, and of the health that was taken; None: no word.
+        # The tag in the messages of the monitor, and in the health used; None: no message yet.
         self._tag: str | None = None
         self._health_tag: str | None = None
         self._now_ns = 0
@@ -79,22 +79,22 @@ class Board:
         self._alarms: dict[str, AlarmView] = {}
 
     def take(self, type_name: str, fields: Fields) -> None:
-        """Take a message; one of another type changes nothing."""
+        """Process a message; messages of other types are ignored."""
         if type_name == HEALTH:
             self._health(fields)
         elif type_name in MESSAGES:
             time_ns, view = decoded(type_name, fields)
             self._tag = str(fields['header']['frame_id'])
             if self._health_tag not in (None, self._tag):
-                # It came before it was known which monitor of several this is.
+                # That health may be of another monitor: the tag was not known then.
                 self.inputs, self.recorder, self._health_tag = (), None, None
                 self.items = ()
             self._unit = self._tag or self._unit
             if isinstance(view, SampleView):
                 if time_ns < self._now_ns and self._samples:
-                    # The clock went back: what was drawn before does not belong beside it.
+                    # The clock went back: the earlier samples must not be drawn with the new ones.
                     self._samples.clear()
-                # An alarm is never later than the sample that brought it.
+                # An alarm is never later than its sample, so the sample sets the time.
                 self._now_ns = time_ns
                 self._samples.append(view)
             elif isinstance(view, CurveView):
@@ -108,7 +108,7 @@ class Board:
                 self._diagnosis = view
 
     def frame(self, source: str, note: str = '') -> Frame:
-        """Return what is known now."""
+        """Return the current state as a frame."""
         return Frame(
             self._unit, source, self._now_ns, note, self._curve,
             self._samples[-1] if self._samples else None, tuple(self._samples),
@@ -117,11 +117,11 @@ class Board:
         )  # fmt: skip
 
     def at(self, time_ns: int) -> None:
-        """Set the plant's time where no prediction tells it."""
+        """Advance the plant time if no sample sets it."""
         self._now_ns = max(self._now_ns, time_ns)
 
     def _health(self, fields: Fields) -> None:
-        # `/diagnostics` is one topic for every node there is; a monitor sends its tag along.
+        # `/diagnostics` is shared by all nodes; a monitor adds its tag.
         tag = str(fields['header']['frame_id']) or None if self._tag is None else self._tag
         ours = [s for s in fields['status'] if s['hardware_id'] == tag and _is_item(s)]
         if ours:
@@ -139,19 +139,19 @@ class Board:
         self.recorder = next((i for i in items if i.name == 'recorder'), self.recorder)
         fit = next((status for status in ours if _item_name(status) == 'fit'), None)
         if fit is not None and self._curve is not None and not self._samples:
-            # Without a sample the age of the curve is what tells the plant's time.
+            # Without samples, the plant time follows from the age of the curve.
             self.at(self._curve.window[1] + _age_ns(fit))
 
 
 def decoded(
     type_name: str, fields: Fields
 ) -> tuple[int, CurveView | SampleView | AlarmView | DiagnosisView]:
-    """Return a message of one of `MESSAGES`: its stamp in ns, and what it says.
+    """Return a message of one of `MESSAGES`: its time stamp in ns, and its content.
 
     Raises
     ------
     KeyError, TypeError, ValueError
-        A field is missing, or holds something else.
+        A field is missing, or has a wrong type.
     """
     time_ns = _ns(fields['header']['stamp'])
     if type_name == PREDICTION:
@@ -174,7 +174,7 @@ def decoded(
         advice = tuple(
             advice_of(str(cause['name']), str(cause['meaning']), str(cause['to_do']))
             for cause in fields['causes']
-            if cause.get('to_do')  # recordings of earlier versions do not have it
+            if cause.get('to_do')  # missing in recordings of earlier versions
         )
         return time_ns, DiagnosisView(int(fields['verdict']), said, causes, time_ns, advice)
     return time_ns, CurveView(
@@ -200,7 +200,7 @@ def _values(status: Fields) -> dict[str, str]:
 
 
 def _age_ns(fit: Fields) -> int:
-    """Return the age of the curve that the health tells, 0 where it tells none."""
+    """Return the age of the curve according to the health, 0 if it gives none."""
     try:
         return round(float(_values(fit)[AGE]) * NS_PER_S)
     except (KeyError, ValueError, OverflowError):
@@ -208,7 +208,7 @@ def _age_ns(fit: Fields) -> int:
 
 
 def _item(status: Fields) -> HealthView:
-    """Return a line of the health without the monitor's name before it."""
+    """Return an item of the health, without the name of the monitor."""
     level = status['level']
     number = level[0] if isinstance(level, bytes) else int(level)
     return HealthView(_item_name(status), number, str(status['message']))
@@ -216,7 +216,7 @@ def _item(status: Fields) -> HealthView:
 
 def _item_name(status: Fields) -> str:
     name = str(status['name']).rpartition(': ')[2]
-    # Recordings of earlier versions have the unit's tag before the item.
+    # Recordings of earlier versions have the tag of the unit before the item.
     return name.removeprefix(f'{status["hardware_id"]} ')
 
 

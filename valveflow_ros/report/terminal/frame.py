@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the terminal view shows at one moment: plain records, and the sentences for them."""
+"""The content of the terminal view at one time: plain records, and sentences for them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.words import counted, decimals, duration, moment, signed
 
-# The words of the messages' numbers, as a person says them.
+# The numbers of the messages in plain words.
 CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused', 'provisional')
 SAMPLE_STATES = (
     'no curve to judge by',
@@ -44,18 +44,18 @@ class CurveView:
     breakpoints, values : tuple of float
         u in % MPa^m and power in MW at the ends of the pieces; empty without a curve.
     state : int
-        Place in `CURVE_STATES`.
+        Index in `CURVE_STATES`.
     cause : str
-        Why it is not fresh.
+        Why it is not up to date.
     model_id : str
     window : tuple of int
-        First and last time of its data in ns; 0: none.
+        First and last time of its data in ns; 0 if there are none.
     samples : int
     rmse_mw : float
     shift : str
-        The judgement against the reference; empty: none.
+        The judgement against the reference; empty if there is none.
     exponent : float
-        The m of u = V p^m; NaN: not told.
+        The m of u = V p^m; NaN if unknown.
     """
 
     breakpoints: tuple[float, ...]
@@ -72,18 +72,18 @@ class CurveView:
 
 @dataclass(frozen=True, slots=True)
 class SampleView:
-    """One sample beside what the curve says of it; NaN: not known.
+    """One sample and the prediction of the curve; NaN if unknown.
 
     Attributes
     ----------
     time_ns : int
     state : int
-        Place in `SAMPLE_STATES`.
+        Index in `SAMPLE_STATES`.
     u, measured_mw, residual_mw, average_mw : float
     low_mw, high_mw : float
-        Where the residual should lie, 95 times in a hundred.
+        Expected 95 % range of the residual.
     evidence : float
-        Beyond 1 or -1 there is an alarm.
+        Beyond 1 or -1 the alarm is raised.
     """
 
     time_ns: int
@@ -99,7 +99,7 @@ class SampleView:
 
 @dataclass(frozen=True, slots=True)
 class AlarmView:
-    """One alarm: its name, its place in `ALARM_STATES`, what it says, since when (0: never)."""
+    """One alarm: name, index in `ALARM_STATES`, sentence, time when raised (0: never)."""
 
     name: str
     state: int
@@ -108,13 +108,13 @@ class AlarmView:
 
     @property
     def standing(self) -> bool:
-        """Return True if somebody has to know of it."""
+        """Return True if the alarm needs attention."""
         return self.state != NORMAL
 
 
 @dataclass(frozen=True, slots=True)
 class HealthView:
-    """How an input, the recorder or anything else is: OK, WARN, ERROR or STALE, and why."""
+    """The state of an input, the recorder or another item: OK, WARN, ERROR or STALE; and why."""
 
     name: str
     level: int
@@ -128,14 +128,14 @@ class DiagnosisView:
     Attributes
     ----------
     verdict : int
-        Its place in `VERDICTS`.
+        Index in `VERDICTS`.
     sentence : str
     causes : tuple of str
-        Their names.
+        Names of the causes.
     until_ns : int
         End of the data.
     advice : tuple of str
-        What each cause means in MW and what to do about it, where that is known.
+        Effect of each cause in MW and the recommended action, if known.
     """
 
     verdict: int
@@ -147,18 +147,18 @@ class DiagnosisView:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Everything the view shows at one moment.
+    """The complete content of the view at one time.
 
     Attributes
     ----------
     unit : str
-        The unit's tag; empty: not known.
+        Tag of the unit; empty if unknown.
     source : str
-        Where it comes from, for a person.
+        Description of the data source.
     now_ns : int
-        The plant's time; 0: nothing has come yet.
+        Time of the plant; 0 before the first message.
     note : str
-        A sentence that stands above all, such as what is waited for.
+        A sentence at the top, for example what the view is waiting for.
     """
 
     unit: str = ''
@@ -175,11 +175,11 @@ class Frame:
 
 
 def _word(words: tuple[str, ...], number: int) -> str:
-    """Return the word for a number of a message; one of a later version is said as it is."""
+    """Return the word for a number of a message; unknown numbers are returned as text."""
     return words[number] if 0 <= number < len(words) else f'state {number}'
 
 
-# A sentence and its tone, one of `text.TONES` or '' for plain.
+# A sentence and its style, one of `text.TONES` or '' for plain.
 Said = tuple[str, str]
 NONE_YET = 'None yet.'
 _SHORT = {
@@ -193,7 +193,7 @@ _TONES = {OK: '', WARN: 'warn', STALE: 'bad'}
 
 
 def curve_words(curve: CurveView | None, now_ns: int) -> Said:
-    """Say how old the curve is and what it rests on."""
+    """Return the age and the data of the curve in words."""
     if curve is None:
         return NONE_YET, 'warn'
     if not curve.breakpoints:
@@ -215,7 +215,7 @@ def curve_words(curve: CurveView | None, now_ns: int) -> Said:
 
 
 def sample_words(sample: SampleView | None) -> Said:
-    """Say how the last sample lies to the curve."""
+    """Return the position of the last sample relative to the curve in words."""
     if sample is None:
         return NONE_YET, 'dim'
     state = _word(SAMPLE_STATES, sample.state)
@@ -233,7 +233,7 @@ def sample_words(sample: SampleView | None) -> Said:
 
 
 def alarm_words(alarm: AlarmView) -> Said:
-    """Say how an alarm stands."""
+    """Return the state of an alarm in words."""
     raised = f', raised {_minute(alarm.raised_ns)}'
     if not (alarm.standing and alarm.raised_ns):
         raised = ''
@@ -243,7 +243,7 @@ def alarm_words(alarm: AlarmView) -> Said:
 
 
 def alarms_words(frame: Frame) -> list[Said]:
-    """Say which alarms stand, the most urgent first."""
+    """Return the standing alarms in words, the most urgent first."""
     standing = [alarm for alarm in frame.alarms if alarm.standing]
     if not standing:
         return [('None.', 'good')]
@@ -251,10 +251,10 @@ def alarms_words(frame: Frame) -> list[Said]:
 
 
 def inputs_words(frame: Frame) -> list[Said]:
-    """Say what is wrong with inputs, a line each, and the rest in one line."""
+    """Return a line for each faulty input, and one line for all others."""
     if not frame.inputs:
         return [('Nothing has come from any of them yet.', 'dim')]
-    # What is wrong with several at once is one line, such as a gateway that has stopped.
+    # A problem of several inputs at once is one line, for example a stopped gateway.
     groups: dict[tuple[int, str], list[str]] = {}
     for item in frame.inputs:
         if item.level != OK:
@@ -270,19 +270,19 @@ def inputs_words(frame: Frame) -> list[Said]:
 
 
 def health_words(item: HealthView) -> Said:
-    """Say how one thing is."""
+    """Return the state of one item in words."""
     return f'{short_name(item.name)}: {item.sentence}', _TONES.get(item.level, 'bad')
 
 
 def recorder_words(frame: Frame) -> Said:
-    """Say how the recorder is."""
+    """Return the state of the recorder in words."""
     if frame.recorder is None:
         return 'Nothing is known of it yet.', 'dim'
     return frame.recorder.sentence, _TONES.get(frame.recorder.level, 'bad')
 
 
 def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
-    """Say what the last diagnosis found."""
+    """Return the result of the last diagnosis in words."""
     if diagnosis is None:
         return 'None yet.', 'dim'
     if not diagnosis.verdict and diagnosis.sentence:
@@ -301,5 +301,5 @@ def _minute(time_ns: int) -> str:
 
 
 def short_name(name: str) -> str:
-    """Return a signal's name as it is said in a narrow place."""
+    """Return the short name of a signal, for narrow places."""
     return _SHORT.get(name, name)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of long work: a bar on a terminal, a line now and then anywhere else."""
+"""Progress of long work: a bar on a terminal, otherwise occasional lines."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from typing import TextIO
 _BAR = 20
 _REDRAW_S = 0.1
 _TICK_S = 0.5
-# An estimate from less than this says nothing.
+# Below these values no estimate is given.
 _LEAST_S, _LEAST_SHARE = 2.0, 0.03
-# Where there is no terminal: when the first line comes, and how much longer each pause is.
+# Without a terminal: delay of the first line, and growth of the pauses.
 _FIRST_LINE_S, _LONGER, _LONGEST_PAUSE_S = 15.0, 2.0, 120.0
 
 
 class Progress:
-    """Keeps a bar, or lines, up to date; goes on telling the time between two calls.
+    """Keeps a bar or lines up to date; updates the time also between two calls.
 
     Parameters
     ----------
     err : text stream
     bar : bool
-        Draw a bar; else write lines, few of them.
+        Draw a bar; otherwise write a few lines.
     share_of_time : callable, optional
-        Turns the share of the work that is told, and what is done, into a share of the time.
+        Converts the reported fraction of the work and its description to a fraction of the time.
     clock : callable
-        Time in s that never goes back.
+        Monotonic time in s.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Progress:
         self._ticker: threading.Thread | None = None
 
     def at(self, share: float, what: str) -> None:
-        """Report progress as a share of 1, and what is done now."""
+        """Report progress as a fraction from 0 to 1, and the current step."""
         with self._lock:
             if self._done.is_set():
                 return
@@ -67,7 +67,7 @@ class Progress:
                 self._next_line_s = now + self._pause_s
                 self._start()
             new = what != self._what
-            # What is behind us does not come back.
+            # Progress never decreases.
             self._share = max(self._share, min(max(self._share_of_time(share, what), 0.0), 1.0))
             self._what = what
             self._estimate(now)
@@ -75,14 +75,14 @@ class Progress:
                 self._tell(now)
 
     def tick(self) -> None:
-        """Show the time that has gone by."""
+        """Update the displayed time."""
         with self._lock:
             now = self._clock()
             if self._begun_s is not None and now - self._drawn_s >= _TICK_S:
                 self._tell(now)
 
     def clear(self) -> None:
-        """Take the bar away; it comes again with the next call or tick."""
+        """Remove the bar until the next call or tick."""
         with self._lock:
             if self._shown:
                 self._err.write('\r\x1b[K')
@@ -90,7 +90,7 @@ class Progress:
                 self._shown = False
 
     def write(self, line: str) -> None:
-        """Write a line where the bar is; the bar comes back below it."""
+        """Write a line in place of the bar; the bar appears again below it."""
         with self._lock:
             self.clear()
             self._err.write(line + '\n')
@@ -98,14 +98,14 @@ class Progress:
             self._drawn_s = self._clock()
 
     def end(self) -> None:
-        """Take the bar away for good."""
+        """Remove the bar permanently."""
         with self._lock:
             self._done.set()
             self._begun_s = None
             self.clear()
 
     def left_s(self) -> float:
-        """Return how many seconds are left, infinity if that cannot be told."""
+        """Return the estimated remaining time in seconds; infinity if unknown."""
         return max(0.0, self._ends_s - self._clock())
 
     def _estimate(self, now: float) -> None:
@@ -129,7 +129,7 @@ class Progress:
         bar = self._blocks[0] * full + self._blocks[1] * (_BAR - full)
         when = self._left(now) or self._gone(now)
         text = f'{bar} {100.0 * self._share:3.0f} %  {when}{self._what}'
-        # A line that is broken could not be taken back.
+        # A wrapped line could not be erased.
         width = shutil.get_terminal_size().columns - 1
         self._err.write(f'\r\x1b[K{text[: max(width, 1)]}')
         self._err.flush()
@@ -137,13 +137,13 @@ class Progress:
         self._shown = True
 
     def _gone(self, now: float) -> str:
-        """Return how long it took so far, once that is worth a word."""
+        """Return the elapsed time, or '' if it is very short."""
         assert self._begun_s is not None
         gone = now - self._begun_s
         return f'{in_words(gone)} so far  ' if gone >= _LEAST_S else ''
 
     def _left(self, now: float) -> str:
-        """Return how long it will take, empty where that cannot be told."""
+        """Return the remaining time, or '' if unknown."""
         left = self._ends_s - now
         return f'about {in_words(left)} left  ' if math.isfinite(left) and left >= 0.5 else ''
 
@@ -155,14 +155,14 @@ class Progress:
         while not self._done.wait(_TICK_S):
             try:
                 self.tick()
-            except (OSError, ValueError):  # the stream is gone, and so is its reader
+            except (OSError, ValueError):  # the stream is closed
                 return
 
 
 def in_words(seconds: float) -> str:
     """Return '8 s', '2 min 10 s', '1 h 5 min': above a minute in steps of five seconds.
 
-    Not by `words.duration`: every verb loads this module first, and numpy must not come with it.
+    `words.duration` is not used: every command loads this module, and numpy is slow to load.
     """
     whole = round(seconds) if seconds < 60.0 else round(seconds / 5.0) * 5
     if whole < 60:

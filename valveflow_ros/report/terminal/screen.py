@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The terminal view: a frame drawn as lines, and put on a terminal or told change by change."""
+"""The terminal view: a frame drawn as lines, shown in place or as one line per change."""
 
 from __future__ import annotations
 
@@ -31,32 +31,32 @@ from valveflow_ros.report.terminal.frame import (
 from valveflow_ros.report.terminal.text import Line, cells, clean, cut, labelled, painted
 from valveflow_ros.report.words import duration, in_zone, input_unit_plain, moment, signed
 
-_ENTER = '\x1b[?1049h\x1b[?25l'  # the other screen, no cursor
+_ENTER = '\x1b[?1049h\x1b[?25l'  # alternate screen, no cursor
 _LEAVE = '\x1b[?25h\x1b[?1049l'
 _USUAL = (80, 24)
-# A grid of dots, eight to a character in braille.
+# A grid of dots, eight per character in braille.
 _BRAILLE = 0x2800
-# Which bit of a braille character each of its dots is, by row and column.
+# Bit of each dot in a braille character, by row and column.
 _BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 DOTS_X, DOTS_Y = 2, 4
-_MARGIN = 8  # left of the pictures: a number and its tick
+_MARGIN = 8  # left of the plots: a number and its tick
 _LEAST_CURVE, _LEAST_RESIDUAL = 4, 3
 _MOST_RESIDUAL = 9
 _LONGEST_TEXT = 3
-_WHOLE = 100  # lines of a sentence that is told to its end
+_WHOLE = 100  # maximum lines of a sentence printed in full
 
 
 class Canvas:
-    """A rectangle of characters that lines and marks are put on.
+    """A rectangle of characters for lines and marks.
 
     Parameters
     ----------
     width, height : int
         In characters, at least 1 each.
     low, high : tuple of float
-        The lower left and the upper right corner, in the drawing's own units.
+        The lower left and the upper right corner, in data units.
     unicode : bool
-        Whether braille may be used; without it a dot is an asterisk.
+        True if braille characters may be used; otherwise a dot is an asterisk.
     """
 
     def __init__(
@@ -73,17 +73,17 @@ class Canvas:
         self._marks: dict[tuple[int, int], str] = {}
 
     def place(self, x: float, y: float) -> tuple[int, int]:
-        """Return the dot of a point, counted from the upper left; it may lie outside."""
+        """Return the dot of a point, counted from the upper left; it may be outside."""
         across = round((x - self._low[0]) * self._scale[0])
         up = round((y - self._low[1]) * self._scale[1])
         return across, self.height * DOTS_Y - 1 - up
 
     def dot(self, x: float, y: float) -> None:
-        """Put a dot; one outside the rectangle is left out."""
+        """Draw a dot; one outside the rectangle is left out."""
         self._put(*self.place(x, y))
 
     def line(self, points: Sequence[tuple[float, float]]) -> None:
-        """Put straight lines from point to point."""
+        """Draw straight lines between points."""
         for (x0, y0), (x1, y1) in pairwise(points):
             a, b = self.place(x0, y0), self.place(x1, y1)
             steps = min(max(abs(b[0] - a[0]), abs(b[1] - a[1]), 1), 10_000)
@@ -94,21 +94,21 @@ class Canvas:
                 )
 
     def level(self, y: float, character: str) -> None:
-        """Put a character along a level wherever nothing else is drawn."""
+        """Draw a character along a horizontal line where nothing else is drawn."""
         row = self.place(0.0, y)[1] // DOTS_Y
         if 0 <= row < self.height:
             for column in range(self.width):
                 self._marks.setdefault((row, -1 - column), character)
 
     def mark(self, x: float, y: float, character: str) -> None:
-        """Put a character over everything; outside, it stands at the border."""
+        """Draw a character over everything; a point outside is moved to the border."""
         across, down = self.place(x, y)
         column = min(max(across // DOTS_X, 0), self.width - 1)
         row = min(max(down // DOTS_Y, 0), self.height - 1)
         self._marks[row, column] = character
 
     def rows(self) -> list[str]:
-        """Return the lines of characters, from above, each as long as the canvas is wide."""
+        """Return the lines of characters from top to bottom, each as long as the width."""
         return [
             ''.join(self._character(row, column) for column in range(self.width))
             for row in range(self.height)
@@ -132,19 +132,19 @@ def screen(
     frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True,
     zone: tzinfo | None = None, whole: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Return a frame as the lines that a terminal is sent.
+    """Return a frame as the lines for a terminal.
 
     Parameters
     ----------
     frame : Frame
     width, height : int
-        The terminal's size; there are never more lines, nor longer ones.
+        Size of the terminal; the lines are never more or longer than it.
     colour, unicode : bool
-        What the terminal can do.
+        Capabilities of the terminal.
     zone : tzinfo, optional
-        Times are told in it; in UTC without.
+        Time zone of the times; UTC by default.
     whole : bool
-        Every sentence is told to its end, in as many lines more as that takes.
+        Print every sentence in full, in as many additional lines as needed.
     """
     lines = _lines(frame, max(20, width), max(5, height), unicode, zone, whole)
     shown = lines if whole else lines[: max(1, height)]
@@ -175,8 +175,8 @@ def _lines(
 
 
 def _shares(left: int, frame: Frame) -> tuple[int, int]:
-    """Return how many rows the curve and the residuals get, without the axis of the curve."""
-    # Room for sentences that need more than one line comes first.
+    """Return the numbers of rows of the curve and the residuals, without the curve's axis."""
+    # First reserve space for sentences of more than one line.
     left -= 3 if left > _LEAST_CURVE + _LEAST_RESIDUAL + 4 else 0
     if frame.curve is None or not frame.curve.breakpoints:
         return 0, min(left, _MOST_RESIDUAL) if left >= _LEAST_RESIDUAL and frame.samples else 0
@@ -202,7 +202,7 @@ def _title(frame: Frame, width: int, zone: tzinfo | None) -> Line:
 
 
 def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line]:
-    """Return alarms, inputs, recorder and diagnosis, each in at most so many lines."""
+    """Return alarms, inputs, recorder and diagnosis, each in at most ``most`` lines."""
     lines: list[Line] = []
     for label, told in (
         ('Alarms   ', alarms_words(frame)),
@@ -217,7 +217,7 @@ def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line
 
 
 def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
-    """Return the curve with its breakpoints and the operating point, and the axis below."""
+    """Return the curve with its breakpoints and the operating point, and its axis."""
     curve, last = frame.curve, frame.last
     pairs = zip(curve.breakpoints, curve.values, strict=False) if curve else ()
     points = [pair for pair in pairs if all(map(math.isfinite, pair))]
@@ -275,7 +275,7 @@ def _picture(canvas: Canvas, marks: dict[int, str], tone: str) -> list[Line]:
 def changes(before: Frame, now: Frame) -> list[tuple[str, str]]:
     """Return what changed: curve, alarm, input, recorder, diagnosis or note, and a sentence.
 
-    This is the view of whoever has no terminal. Values that move all the time are no changes.
+    This is the output without a terminal. Continuously varying values do not count as changes.
     """
     return [(what, clean(told)) for what, told in _changes(before, now)]
 
@@ -284,7 +284,7 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
     if now.note and now.note != before.note:
         yield 'note', now.note
     if now.curve is not None and now.curve != before.curve:
-        # Its age is not news.
+        # The age of the curve is not a change.
         yield 'curve', curve_words(now.curve, 0)[0]
     old = {alarm.name: alarm for alarm in before.alarms}
     for alarm in now.alarms:
@@ -302,15 +302,15 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
 
 
 class Screen:
-    """Shows frames: in place on a terminal, as a line per change anywhere else.
+    """Show frames: in place on a terminal, otherwise as one line per change.
 
     Parameters
     ----------
     out : text stream
     environment : mapping, optional
-        Where ``TERM`` and ``NO_COLOR`` are looked up; the process's by default.
+        Source of ``TERM`` and ``NO_COLOR``; the process environment by default.
     zone : tzinfo, optional
-        Times are told in it; in UTC without.
+        Time zone of the times; UTC by default.
     """
 
     def __init__(
@@ -330,7 +330,7 @@ class Screen:
         self._handlers: dict[signal.Signals, object] = {}
 
     def __enter__(self) -> Screen:
-        """Take the terminal; a request to end comes as `KeyboardInterrupt` from now on."""
+        """Prepare the terminal; termination signals raise `KeyboardInterrupt` from now on."""
         self._handlers = _handled()
         if self.in_place:
             self._out.write(_ENTER)
@@ -343,7 +343,7 @@ class Screen:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal."""
         if self._entered:
             with suppress(OSError):
                 self._out.write(_LEAVE)
@@ -351,7 +351,7 @@ class Screen:
         _put_back(self._handlers)
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, or what has changed since the last one."""
+        """Show a frame, or its changes since the last one."""
         if self.in_place:
             rows = self._rows(frame)
             body = '\x1b[K\r\n'.join(rows)
@@ -365,7 +365,7 @@ class Screen:
         self._out.flush()
 
     def text(self, frame: Frame) -> str:
-        """Return a frame as text that stays."""
+        """Return a frame as permanent text."""
         return '\n'.join(self._rows(frame, whole=True)).rstrip()
 
     def _rows(self, frame: Frame, whole: bool = False) -> list[str]:
@@ -377,7 +377,7 @@ class Screen:
 
 
 def _handled() -> dict[signal.Signals, object]:
-    """Let requests to end come as `KeyboardInterrupt`; return what handled them before."""
+    """Make termination signals raise `KeyboardInterrupt`; return the earlier handlers."""
     before: dict[signal.Signals, object] = {}
     for number in (signal.SIGTERM, signal.SIGHUP):
         with suppress(ValueError):  # not in the main thread
@@ -392,7 +392,7 @@ def _put_back(handlers: Mapping[signal.Signals, object]) -> None:
 
 @contextmanager
 def ending() -> Iterator[None]:
-    """Let a request to end come as `KeyboardInterrupt` inside."""
+    """Make termination signals raise `KeyboardInterrupt` inside the context."""
     before = _handled()
     try:
         yield

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of a terminal view: pieces of text with a tone, and what a terminal is sent for them."""
+"""Lines of a terminal view: pieces of text with a style, and their terminal codes."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import unicodedata
 from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterator
 
-# Pieces of a line: the text of each, and one of the tones below or '' for plain.
+# Pieces of a line: the text of each, and one of the styles below or '' for plain.
 Line = tuple[tuple[str, str], ...]
 
-# Colour-blind safe: bad differs from good in weight and brightness too, and in the words.
+# Suitable for colour blindness: bad and good also differ in weight, brightness and words.
 TONES = {'strong': '1', 'dim': '2', 'curve': '36', 'good': '32', 'warn': '33', 'bad': '1;31'}
-# One character for one, so that a line stays as long as it was.
+# One character for one, so that the length of a line stays.
 _PLAIN = str.maketrans('…·●┄─−\u202f±│°', '~|@--- ~| ')
-# More than any terminal shows of a sentence: what comes from others may be of any length.
+# Longer than any displayed sentence: external text may have any length.
 _LONGEST = 4096
 _BLANKS = re.compile(r'[^\S\u202f]+')
 
 
 def clean(text: str) -> str:
-    """Return a text of others as it may stand on a terminal: no control characters, one line."""
+    """Return external text safe for a terminal: no control characters, one line."""
     if len(text) > _LONGEST:
         text = f'{text[: _LONGEST - 1]}…'
     text = _BLANKS.sub(' ', text).strip()
@@ -31,7 +31,7 @@ def clean(text: str) -> str:
 
 
 def cells(text: str) -> int:
-    """Return how many places of a terminal a text takes."""
+    """Return the number of terminal columns of a text."""
     wide = sum(unicodedata.east_asian_width(c) in 'WF' for c in text)
     return len(text) + wide - sum(bool(unicodedata.combining(c)) for c in text)
 
@@ -49,7 +49,7 @@ def cut(text: str, width: int) -> str:
 
 
 def wrapped(text: str, width: int, most: int) -> list[str]:
-    """Return a text in at most so many lines of a width; what is left out ends in an ellipsis."""
+    """Return a text in at most ``most`` lines of a width; omitted text becomes an ellipsis."""
     lines = ['']
     for word in text.split(' '):
         longer = f'{lines[-1]} {word}'.lstrip()
@@ -64,7 +64,7 @@ def wrapped(text: str, width: int, most: int) -> list[str]:
 
 
 def labelled(label: str, text: str, tone: str, width: int, most: int) -> Iterator[Line]:
-    """Yield the lines of a text that hangs beside a label."""
+    """Yield the lines of a text, indented by a label."""
     space = len(label) + 2
     for k, line in enumerate(wrapped(clean(text), max(1, width - space), most)):
         head = f'{label}  ' if k == 0 else ' ' * space
@@ -72,7 +72,7 @@ def labelled(label: str, text: str, tone: str, width: int, most: int) -> Iterato
 
 
 def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
-    """Return what a terminal is sent for a line, never longer than ``width`` places."""
+    """Return the terminal output of a line, at most ``width`` columns."""
     parts, left = [], width
     for text, tone in line:
         shown = cut(text, left)
@@ -86,32 +86,32 @@ def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
     return ''.join(parts).rstrip(' ')
 
 
-# Numbers that a person types behind an option: read, or refused in words.
+# Parsers of numeric options, with readable error messages.
 
 
 def number(
     wanted: str, low: float, high: float, example: str, *, above: bool = False
 ) -> Callable[[str], float]:
-    """Return a reader of numbers for ``type=`` of an option.
+    """Return a parser of numbers for ``type=`` of an option.
 
     Parameters
     ----------
     wanted : str
-        What is meant, with its unit: 'a number of days'.
+        Description with unit: 'a number of days'.
     low, high : float
-        The range; if it has no ends, any number that is finite.
+        The range; if both ends are infinite, any finite number is allowed.
     example : str
-        How it would be written right: '--days 10'.
+        A correct example: '--days 10'.
     above : bool
-        ``low`` itself is too small.
+        True if ``low`` itself is not allowed.
 
     Returns
     -------
     callable
-        It raises `ArgumentTypeError` that goes on after the option's name: 'must be a number
-        of days above 0 and at most 400, such as --days 10; 'ten' is no number'.
+        It raises `ArgumentTypeError` with a text that follows the name of the option: 'must be a
+        number of days above 0 and at most 400, such as --days 10; 'ten' is no number'.
     """
-    # No powers of ten: a person reads 1000000 rather than 1e+06.
+    # No powers of ten: 1000000 is easier to read than 1e+06.
     first, last = f'{low:.15g}', f'{high:.15g}'
     between = f' above {first} and at most {last}' if above else f' from {first} to {last}'
     if math.isinf(low) and math.isinf(high):
@@ -130,7 +130,7 @@ def number(
 
 
 def whole(wanted: str, low: int, high: int | None, example: str) -> Callable[[str], int]:
-    """Return a reader of whole numbers; parameters and errors as of `number`."""
+    """Return a parser of whole numbers; parameters and errors as for `number`."""
     between = f' of {low} or more' if high is None else f' from {low} to {high}'
 
     def read(text: str) -> int:
@@ -146,7 +146,7 @@ def whole(wanted: str, low: int, high: int | None, example: str) -> Callable[[st
 
 
 def zone_argument(parser: ArgumentParser) -> None:
-    """Add the option that says in which time zone people are told times."""
+    """Add the option for the time zone of the output."""
     parser.add_argument(
         '--time-zone', metavar='ZONE', type=_zone, default='',
         help='zone in which times are told, such as Europe/Berlin or +01:00 (default: UTC)',
@@ -154,7 +154,7 @@ def zone_argument(parser: ArgumentParser) -> None:
 
 
 def _zone(text: str) -> str:
-    # Loaded late, as a verb that only names the options need not load it.
+    # Loaded late: it is not needed to list the options.
     from valveflow_ros.errors import InputError
     from valveflow_ros.records import zone_of
 
