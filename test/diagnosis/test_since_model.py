@@ -12,10 +12,10 @@ from diagnosis_records import diagnosed, record, table, unit
 from streams import needs_jit
 
 from valveflow_ros.diagnosis.causes import TO_DO
+from valveflow_ros.diagnosis.causes.since_model import since_model
 from valveflow_ros.diagnosis.diagnose import diagnose
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.grids import ORDER
-from valveflow_ros.diagnosis.since_model import since_model
 from valveflow_ros.records import Signal
 
 pytestmark = needs_jit

@@ -14,6 +14,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues, told
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.causes.curve import either_bend_sentence
+from valveflow_ros.diagnosis.causes.since_model import Change, since_model
 from valveflow_ros.diagnosis.evidence import (
     LARGEST_P,
     Certainty,
@@ -46,7 +47,6 @@ from valveflow_ros.diagnosis.result import (
 )
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Found, Progress, other_bend, search, simplified
-from valveflow_ros.diagnosis.since_model import Change, since_model
 from valveflow_ros.diagnosis.slow import (
     LEAST_DRIFT_MW,
     NAMED_SHAPE,
