@@ -31,7 +31,7 @@ _LEAST_SIGNALS = 2
 _NEAR_MEDIAN = 0.25  # relative difference from the median of regular time steps
 _REGULAR_SHARE = 0.6
 _LOW = 0.02  # quantile of the changes that is used as dead band
-_BAND_OF_MEDIAN = 0.4  # of the median change: noise without dead band has 2 % of its changes below 0.04
+_BAND_OF_MEDIAN = 0.4  # minimum ratio of dead band and median change; ordinary noise has 0.02
 _RESOLUTIONS = 5.0  # minimum dead band in resolution steps of the record, if rows are regular
 # The historian stores a value because of its age if this fraction of the gaps is within this
 # factor, and if this many times fewer gaps are within the same factor below them.
