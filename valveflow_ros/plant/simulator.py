@@ -110,7 +110,7 @@ class Recorder:
             yield self._part(window, first, count)
 
     def _part(self, window: PlantRows, first: int, count: int) -> SimulatedLog:
-        """Return the record of ``count`` rows from ``first`` on; in the window they begin at ``behind``."""
+        """Return the record of rows ``[first, first + count)``, at ``behind`` in the window."""
         unit = self._hooks.unit
         rows = window.part(self.behind, self.behind + count)
         power, noise = self._stamped(window.power, count), self._stamped(window.noise, count)
