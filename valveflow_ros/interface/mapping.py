@@ -38,7 +38,7 @@ _STAND_IN = {
     'valve_command': 50.0,
 }
 _MOST_LOOKS = 12
-# Limit of the number of attempts: each may read the whole table.
+# Progress message, because each further attempt may read the whole table.
 LOOKING_ON = 'looking for what else the table leaves open'
 
 
