@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Put the copyright line and the licence at the head of each source file that lacks them.
+"""Add the copyright line and the licence to each source file that lacks them.
 
     python tools/headers.py
 
-A second run changes nothing. Messages have none, because their first comment is their
-documentation, nor have the parts of pages, which become parts of reports.
+A second run changes nothing. Messages get no header, because their first comment is their
+documentation. The parts of pages get none, because they become parts of reports.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def sources() -> Iterator[Path]:
 
 
 def parts(path: Path) -> tuple[str, str]:
-    """Return the line that names the interpreter, if there is one, and the rest of a file."""
+    """Return the interpreter line, if there is one, and the rest of a file."""
     text = path.read_text(encoding='utf-8')
     first, _, rest = text.partition('\n')
     return (f'{first}\n', rest) if first.startswith('#!') else ('', text)
@@ -43,11 +43,11 @@ def lacking() -> list[Path]:
 
 
 def main() -> int:
-    """Add what is missing and say to how many files; return the exit status."""
+    """Add missing headers and print the number of files; return the exit status."""
     missing = lacking()
     for path in missing:
         first, rest = parts(path)
-        # A comment that begins a file stays apart from the header.
+        # A comment at the beginning of a file stays separate from the header.
         gap = '\n' if rest.startswith('#') else ''
         path.write_text(f'{first}{HEADER}{gap}{rest}', encoding='utf-8')
     print(f'{len(missing)} files changed')

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Drive the real ros2 command line against the nodes, and write down what was tried and found.
+"""Test the nodes with the real ros2 command line, and record the checks and results.
 
     python tools/jazzy.py [--write]
 
-It needs ros2cli and launch_ros, so a ROS 2 installation; without them it says so and ends with 0.
-Every check is a sentence, the command a person would type, and what it must say. ``--write`` puts
+It needs ros2cli and launch_ros of a ROS 2 installation; without them it prints this and returns
+0. Every check is a sentence, the command of a user, and the required output. ``--write`` writes
 the table into docs/jazzy.md.
 """
 
@@ -31,21 +31,21 @@ import yaml
 PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'jazzy.md'
 _BEGIN, _END = '<!-- tried -->\n', '<!-- end of tried -->\n'
 _NODE = '/valveflow_monitor'
-# How long a command may take on a busy machine, and a node until it listens.
+# Time limits on a busy machine of a command, and of the start of a node.
 _PATIENCE_S, _START_S, _SETTLE_S = 120.0, 180.0, 20.0
 
 
 class NotSeenError(Exception):
-    """A check did not find what it must."""
+    """A check did not find the required output."""
 
 
 class Bench:
-    """The nodes that run, the folder they run in, and the checks made so far.
+    """The running nodes, their folder, and the checks made so far.
 
     Attributes
     ----------
     rows : list of tuple of str
-        Check, command and what was found; that begins with 'FAILED' where it was another thing.
+        Check, command and result; the result begins with 'FAILED' if it is not as required.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -53,7 +53,7 @@ class Bench:
         self.rows: list[tuple[str, str, str]] = []
 
     def ros2(self, *words: str, patience_s: float = _PATIENCE_S) -> str:
-        """Return what a command of ros2 prints, stdout and stderr."""
+        """Return the output of a ros2 command, stdout and stderr."""
         command = [shutil.which('ros2') or 'ros2', *words]
         done = subprocess.run(
             command, cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -62,7 +62,7 @@ class Bench:
         return done.stdout
 
     def check(self, sentence: str, command: str, found: Callable[[], str]) -> None:
-        """Make a check; ``found`` returns what was seen, or raises `NotSeenError`."""
+        """Make a check; ``found`` returns the result, or raises `NotSeenError`."""
         try:
             seen = found()
         except (NotSeenError, subprocess.TimeoutExpired) as error:
@@ -71,12 +71,12 @@ class Bench:
         self.rows.append((sentence, command, seen))
 
     def says(self, sentence: str, pattern: str, *words: str) -> None:
-        """Check that a command of ros2 prints what a pattern matches."""
+        """Check that the output of a ros2 command matches a pattern."""
 
         def found() -> str:
             end_s, match = time.monotonic() + _SETTLE_S, None
             while match is None:
-                # The daemon may not have seen yet who came and who went.
+                # The daemon may not yet know which nodes started and ended.
                 said = self.ros2(*words)
                 match = re.search(pattern, said, re.S)
                 if match is None and time.monotonic() > end_s:
@@ -87,7 +87,7 @@ class Bench:
 
     @contextlib.contextmanager
     def running(self, ready: str, *words: str) -> Iterator[subprocess.Popen[str]]:
-        """Run a command of ros2 until its output matches ``ready``; end it afterwards."""
+        """Run a ros2 command until its output matches ``ready``; end it afterwards."""
         log = self.folder / f'{len(list(self.folder.glob("*.log")))}.log'
         with log.open('w') as out:
             process = subprocess.Popen(
@@ -104,7 +104,7 @@ class Bench:
 
     @property
     def log(self) -> str:
-        """Return what the command that was started last has printed."""
+        """Return the output of the last command started."""
         newest = max(self.folder.glob('*.log'), key=lambda path: int(path.stem))
         return newest.read_text()
 
@@ -189,7 +189,7 @@ def parameters(bench: Bench) -> None:
 
 
 def topics(bench: Bench) -> None:
-    """Look at topics: latched messages, quality of service, health, samples without a quality."""
+    """Check topics: latched messages, quality of service, health, samples without a quality."""
     override = f'qos_overrides.{_NODE}/prediction.publisher.reliability:=best_effort'
     with _monitor(bench, '-p', override):
         late = ['--once', '--qos-durability', 'transient_local', '--qos-reliability', 'reliable']
@@ -234,7 +234,7 @@ def topics(bench: Bench) -> None:
 
 
 def launching(bench: Bench) -> None:
-    """Launch: arguments, two units, a killed and an ended monitor, the demo."""
+    """Check launch: arguments, two units, a killed and an ended monitor, the demo."""
     bench.says(
         'Every argument is explained', "'unit_tag':[^']*", 'launch', 'valveflow_ros',
         'monitor.launch.py', '--show-args',
@@ -320,7 +320,7 @@ def launching(bench: Bench) -> None:
 
 
 def units_of_a_host(bench: Bench) -> None:
-    """Launch: a list of units, each with its parameter file."""
+    """Check launch: a list of units, each with its parameter file."""
     for k in (1, 2):
         given = {'unit_tag': f'U{k}', 'record_directory': f'{bench.folder}/u{k}'}
         text = yaml.safe_dump({'/**': {'ros__parameters': given}})
@@ -355,7 +355,7 @@ def _managed(bench: Bench) -> str:
             )  # fmt: skip
             if 'success=True' not in said:
                 raise NotSeenError(f'{word} {node}: {said[-200:]}')
-            if state != 'finalized':  # who is has ended
+            if state != 'finalized':  # the process has ended
                 said = bench.ros2(
                     'service', 'call', f'{node}/get_state', 'lifecycle_msgs/srv/GetState'
                 )
@@ -367,7 +367,7 @@ def _managed(bench: Bench) -> str:
 
 
 def _unit(number: int, tag: str, **more: str) -> dict[str, object]:
-    """Return the part of a launch file that starts a monitor for a unit."""
+    """Return the part of a launch file that starts the monitor of a unit."""
     given = {'namespace': f'unit_{number}', 'unit_tag': tag, 'use_respawn': 'true', **more}
     include = {
         'file': '$(find-pkg-share valveflow_ros)/launch/monitor.launch.py',

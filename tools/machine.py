@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Whether this machine can carry the set-up; the first thing it lacks, in a sentence."""
+"""Check that this machine is suitable for the set-up; report the first missing item."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMPILERS = (
 
 
 def check_machine() -> None:
-    """Raise `SetupError` for the first thing this machine lacks."""
+    """Raise `SetupError` for the first missing requirement of this machine."""
     check_platform()
     check_path()
     for language, variable, names in COMPILERS:
@@ -33,7 +33,7 @@ def check_machine() -> None:
 
 
 def check_platform() -> None:
-    """Refuse a machine for which there are no wheels of ROS 2."""
+    """Raise `SetupError` if there are no wheels of ROS 2 for this machine."""
     libc, version = platform.libc_ver()
     numbers = tuple(int(x) for x in re.findall(r'\d+', version)[:2])
     right = sys.platform == 'linux' and platform.machine() == 'x86_64' and sys.maxsize > 2**32
@@ -47,7 +47,7 @@ def check_platform() -> None:
 
 
 def check_path() -> None:
-    """Refuse a path that scripts' first lines or the ROS build cannot take."""
+    """Raise `SetupError` for a path that shebang lines or the ROS build cannot handle."""
     if re.search(r'[\s:;]', str(ROOT)):
         raise SetupError(
             'the path of this folder holds a blank, a colon or a semicolon, which the ROS build '
@@ -56,7 +56,7 @@ def check_path() -> None:
 
 
 def check_compiler(language: str, variable: str, names: tuple[str, ...]) -> None:
-    """Look for the compiler as CMake does: the variable, else one of the usual names."""
+    """Search the compiler like CMake: the environment variable, else the usual names."""
     chosen = os.environ.get(variable, '').split()[:1]
     if any(shutil.which(name) for name in chosen or names):
         return
@@ -68,7 +68,7 @@ def check_compiler(language: str, variable: str, names: tuple[str, ...]) -> None
 
 
 def check_headers() -> None:
-    """Look for Python.h: message packages are C extensions of this Python."""
+    """Search Python.h, because message packages are C extensions of this Python."""
     if Path(str(sysconfig.get_config_var('INCLUDEPY')), 'Python.h').is_file():
         return
     name = f'python{sys.version_info.major}.{sys.version_info.minor}'

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The second step: valveflow_msgs and valveflow_ros, built by colcon into install/."""
+"""Second step of the set-up: build valveflow_msgs and valveflow_ros by colcon into install/."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from tree import (
 
 MESSAGES = 'valveflow_msgs'
 NODE = 'valveflow_ros'
-# Halves the time of the step that is most of the set-up's; see the file.
+# Halves the time of the longest step of the set-up; see the file.
 QUICK = ROOT / 'tools' / 'quick_build.cmake'
 LOADS = f'import rclpy, {NODE}; from {MESSAGES}.msg import PlantSample; PlantSample()'
 
 
 def messages_key(wheels: str) -> str:
-    """Hash what the interface package is built from."""
+    """Return the hash of the inputs of the interface package."""
     compiler = [os.environ.get(name, '') for name in ('CC', 'CXX', 'CFLAGS', 'CXXFLAGS')]
     words = [x.encode() for x in (wheels, *compiler)]
     files = [*sorted(p for p in (ROOT / 'msg').rglob('*') if p.is_file()), QUICK, Path(__file__)]
@@ -41,10 +41,10 @@ def messages_key(wheels: str) -> str:
 
 
 def node_key(messages: str) -> str:
-    """Hash what the node package is built from.
+    """Return the hash of the inputs of the node package.
 
     Its Python files are linked, not copied, so an edit takes effect without a
-    build; of launch/ and config/ only the names count for the same reason.
+    build. For the same reason only the file names of launch/ and config/ are used.
     """
     files = [ROOT / name for name in ('package.xml', 'setup.py', 'setup.cfg')]
     names = sorted(str(p) for d in ('config', 'launch') for p in (ROOT / d).glob('*'))
@@ -53,14 +53,14 @@ def node_key(messages: str) -> str:
 
 
 def packages_done(wheels: str) -> bool:
-    """Whether both packages stand in install/ as they would be built now."""
+    """Return True if both packages in install/ are up to date."""
     messages = messages_key(wheels)
     node = node_key(messages)
     return stamped(INSTALL / MESSAGES, messages) and stamped(INSTALL / NODE, node)
 
 
 def build_packages(wheels: str, log: Path) -> None:
-    """Build what is not up to date, and try to load it."""
+    """Build packages that are not up to date, and test that they can be imported."""
     INSTALL.mkdir(exist_ok=True)
     stamp(INSTALL, 'unfinished')
     messages = messages_key(wheels)
@@ -68,7 +68,7 @@ def build_packages(wheels: str, log: Path) -> None:
         if stamped(INSTALL / package, key):
             continue
         say(f'{package} into install/ ...')
-        # colcon only adds: what an older message or entry point left would stay.
+        # colcon only adds files: those of an older message or entry point would remain.
         for folder in (BUILD / package, INSTALL / package):
             shutil.rmtree(folder, ignore_errors=True)
         problem = colcon_build(package, log)
@@ -84,7 +84,7 @@ def build_packages(wheels: str, log: Path) -> None:
 
 
 def check_install() -> None:
-    """Keep off an install/ that somebody made with their own colcon and their own ROS."""
+    """Raise `SetupError` if install/ was created by the user's own colcon and ROS."""
     if INSTALL.exists() and any(INSTALL.iterdir()) and not (INSTALL / STAMP).exists():
         raise SetupError(
             'install/ holds a build that make setup did not make; move it away or run make clean'
@@ -92,7 +92,7 @@ def check_install() -> None:
 
 
 def link_command() -> None:
-    """Put `valveflow` alone where env.sh points PATH: the nodes are for ros2 and launch files."""
+    """Link only `valveflow` into the folder in PATH; the nodes are for ros2 and launch files."""
     command = INSTALL / NODE / 'bin' / 'valveflow'
     command.parent.mkdir(exist_ok=True)
     command.symlink_to(f'../lib/{NODE}/valveflow')
@@ -101,7 +101,7 @@ def link_command() -> None:
 def colcon_build(package: str, log: Path) -> str | None:
     """Run colcon; return None, or why it failed."""
     command: list[str | Path] = [VENV / 'bin' / 'colcon', '--log-base', LOG, 'build']
-    # colcon does not look below a package, so the interface package is named.
+    # colcon does not search inside a package, so the interface package is named.
     command += ['--base-paths', ROOT, ROOT / 'msg', '--packages-select', package]
     command += ['--build-base', BUILD, '--install-base', INSTALL, '--symlink-install']
     command += ['--event-handlers', 'console_direct+', '--cmake-args', '-DBUILD_TESTING=OFF']
@@ -112,9 +112,9 @@ def colcon_build(package: str, log: Path) -> str | None:
         AMENT_PREFIX_PATH=str(VENV),
         CMAKE_PREFIX_PATH=str(VENV),
         VIRTUAL_ENV=str(VENV),
-        # colcon by itself also limits the load, and beside other work builds one file at a time.
+        # By default colcon also limits the load, and on a busy machine builds one file at a time.
         MAKEFLAGS=f'-j{os.cpu_count() or 1}',
-        # A person's own colcon defaults are for their own workspaces.
+        # The user's own colcon defaults are for other workspaces.
         COLCON_HOME=str(BUILD / 'colcon_home'),
         COLCON_DEFAULTS_FILE=os.devnull,
     )

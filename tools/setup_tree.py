@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Set up the tree: wheels into .venv, the two packages into install/.
 
-Each step leaves a stamp, a hash of everything it depends on, and is skipped
-while the stamp fits. What is missing is said in one sentence.
+Each step writes a stamp, a hash of all its inputs, and is skipped if the stamp
+is up to date. A missing requirement is reported in one sentence.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from wheels import install_wheels, make_venv, repair_cmake, wheels_key
 
 
 def compile_ahead(folder: Path, log: Path) -> None:
-    """Compile modules to bytecode, which no installer here does.
+    """Compile modules to bytecode, because the installers used here do not.
 
-    Without it the first start takes three times as long, and every start does where Python may not
-    write beside its modules. A file that cannot be compiled is one that nobody imports.
+    Otherwise the first start takes three times as long, and every start if Python may not write
+    beside its modules. Files that cannot be compiled are ignored: they are never imported.
     """
     run([PYTHON, '-m', 'compileall', '-q', '-j', '0', folder], log)
 
 
 def steps() -> None:
-    """Do what has not been done yet."""
+    """Run the steps that are not up to date."""
     wheels = wheels_key()
     if stamped(VENV, wheels) and packages_done(wheels):
         return
@@ -57,7 +57,7 @@ def steps() -> None:
 
 
 def main() -> int:
-    """Set up, one at a time in a folder, and turn every failure into a sentence."""
+    """Set up with a lock on the folder, and report every failure in one sentence."""
     folder = os.open(ROOT, os.O_RDONLY)
     try:
         try:

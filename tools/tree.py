@@ -1,8 +1,8 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the parts of the set-up share: the tree's folders, stamps, running a command.
+"""Common parts of the set-up: the tree's folders, stamps, running a command.
 
-Only the standard library: this runs on a bare Python, before anything is installed.
+It uses the standard library only, because it runs before anything is installed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ BUILD = ROOT / 'build'
 LOG = ROOT / 'log'
 STAMP = '.valveflow-setup'
 
-# What a sourced ROS, another environment or an outer make would leave to our children.
+# Variables of another ROS, another environment or an outer make, not for child processes.
 FOREIGN = (
     'AMENT_PREFIX_PATH',
     'CMAKE_PREFIX_PATH',
@@ -41,7 +41,7 @@ FOREIGN = (
     'VIRTUAL_ENV',
     '_ROS_WHEELS_BOOTSTRAP_COMPLETE',
 )
-# What stands in the output of pip, uv and compilers, and what it means for a person.
+# Texts in the output of pip, uv and compilers, and their explanation for the user.
 KNOWN = (
     (r'no space left', 'no space left on the disk'),
     (r'name resolution|name or service not known|dns error', 'the registry has no address here'),
@@ -56,16 +56,16 @@ KNOWN = (
 
 
 class SetupError(Exception):
-    """Something is missing; the text is one sentence with the cure."""
+    """Something is missing; the message is one sentence with the solution."""
 
 
 def say(text: str) -> None:
-    """Tell the person what is going on."""
+    """Print a progress message."""
     print(f'setup: {text}', file=sys.stderr, flush=True)
 
 
 def digest(parts: Iterable[bytes]) -> str:
-    """Return one hash of byte strings, told apart from each other by their lengths."""
+    """Return one hash of byte strings; their lengths are included to separate them."""
     total = hashlib.sha256()
     for part in parts:
         total.update(b'%d:' % len(part))
@@ -74,26 +74,26 @@ def digest(parts: Iterable[bytes]) -> str:
 
 
 def contents(paths: Iterable[Path]) -> Iterator[bytes]:
-    """Yield the names and the bytes of files, in the order given."""
+    """Yield the names and the bytes of files, in the given order."""
     for path in paths:
         yield str(path.relative_to(ROOT)).encode()
         yield path.read_bytes()
 
 
 def stamped(folder: Path, key: str) -> bool:
-    """Whether the step that fills ``folder`` has been done for ``key``."""
+    """Return True if the step that fills ``folder`` was done for ``key``."""
     with contextlib.suppress(OSError):
         return (folder / STAMP).read_text(encoding='ascii') == key
     return False
 
 
 def stamp(folder: Path, key: str) -> None:
-    """Note that the step is done; last, so that an interrupted step is done again."""
+    """Mark the step as done; called last, so that an interrupted step is repeated."""
     (folder / STAMP).write_text(key, encoding='ascii')
 
 
 def clean_environment(**more: str) -> dict[str, str]:
-    """Return this process's environment without what belongs to another ROS or Python."""
+    """Return this process's environment without the variables of another ROS or Python."""
     env = {name: value for name, value in os.environ.items() if name not in FOREIGN}
     env['PATH'] = f'{VENV / "bin"}{os.pathsep}{env.get("PATH", os.defpath)}'
     return env | more
@@ -116,7 +116,7 @@ def run(command: Sequence[str | Path], log: Path, **env: str) -> str | None:
 
 
 def reason(output: str) -> str:
-    """Return why a command failed, from what it printed: a known cause, or the telling line."""
+    """Return why a command failed, from its output: a known cause, or the relevant line."""
     for pattern, meaning in KNOWN:
         if re.search(pattern, output, re.IGNORECASE):
             return meaning

@@ -1,12 +1,12 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Build the wheel and try it in empty environments: times, sizes, and whether it works.
+"""Build the wheel and test it in empty environments: function, times and sizes.
 
     python -m tools.try_install [--keep] PYTHON...
 
 For each Python given by path, with the oldest libraries that the metadata allow and with the
 newest: install the wheel with pip, simulate half a day, identify it with nothing compiled, and
-identify it again. With ``--keep`` the table goes to benchmarks/results/install.json.
+identify it again. With ``--keep`` the table is written to benchmarks/results/install.json.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-# Those whose lower bound stands in setup.py, at that bound.
+# The libraries with a lower bound in setup.py, at that bound.
 OLDEST = ('numpy==1.26.*', 'scipy==1.11.*', 'pandas==2.1.*', 'numba==0.59.*')
 SETS: dict[str, tuple[str, ...]] = {'oldest': OLDEST, 'newest': ()}
-# Numba 0.59 knows no later Python.
+# Numba 0.59 supports no later Python.
 LAST_OF_OLDEST = (3, 12)
 LIBRARIES = re.compile(r'(numpy|scipy|pandas|numba)==(\S+)')
 IDENTIFY = ('identify', 'plant.mcap', '-o', 'result', '--quiet')
 
 
 class FailedError(Exception):
-    """A command did not work; its text is what the command said."""
+    """A command failed; the message is its output."""
 
 
 def run(command: list[str | Path], folder: Path, **environment: str) -> tuple[float, str]:
-    """Run a command; return how long it took, s, and what it printed.
+    """Run a command; return its duration in s and its output.
 
     Raises
     ------
@@ -63,12 +63,12 @@ def version(python: str) -> tuple[int, int]:
 
 
 def megabytes(folder: Path) -> int:
-    """Return how much the files below a folder take, in units of 1e6 bytes."""
+    """Return the size of the files below a folder in units of 1e6 bytes."""
     return round(sum(p.lstat().st_size for p in folder.rglob('*') if p.is_file()) / 1e6)
 
 
 def build(folder: Path) -> Path:
-    """Build the wheel from the tracked files, so that nothing else can get into it."""
+    """Build the wheel from the tracked files, so that it contains nothing else."""
     tree = folder / 'tree'
     for name in run(['git', 'ls-files', '-z'], ROOT)[1].split('\0'):
         if name and (ROOT / name).is_file():
@@ -89,7 +89,7 @@ def trial(python: str, wheel: Path, libraries: tuple[str, ...], folder: Path) ->
     cache = {'NUMBA_CACHE_DIR': str(folder / 'compiled')}
     help_s, _ = run([inside / 'valveflow', '--help'], folder)
     run([inside / 'valveflow', 'simulate', '-o', 'plant.mcap', '--days', '0.5'], folder, **cache)
-    # What the simulation has compiled must not shorten the first identification.
+    # Remove the simulation's compiled code, which would shorten the first identification.
     shutil.rmtree(folder / 'compiled')
     first_s, _ = run([inside / 'valveflow', *IDENTIFY], folder, **cache)
     again_s, _ = run([inside / 'valveflow', *IDENTIFY], folder, **cache)
@@ -100,7 +100,7 @@ def trial(python: str, wheel: Path, libraries: tuple[str, ...], folder: Path) ->
 
 
 def main() -> int:
-    """Try every Python with every set of libraries; return the exit status."""
+    """Test every Python with every set of libraries; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('python', nargs='*', default=[sys.executable])
     parser.add_argument('--keep', action='store_true', help='write the result')

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Unpack the tree beside a lock file of its own: the tests with other Pythons and libraries.
+"""Copy the tree with its own lock file, for tests with other Pythons and libraries.
 
     python tools/versions.py PYTHON
 
-The copy stands in build/versions/ and is set up and tested like any other tree, so nothing of
-this one changes. Its folder is printed.
+The copy is in build/versions/ and is set up and tested like any other tree, so this tree is not
+changed. The folder of the copy is printed.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from pathlib import Path
 
 from tree import BUILD, ROOT, VENV, SetupError, clean_environment, reason, say
 
-# What Ubuntu 24.04, the platform of Jazzy, has beside its Python 3.12; any other Python gets the
-# newest of each. pyarrow 26 refuses NumPy 1.
+# Versions in Ubuntu 24.04, the platform of Jazzy, with its Python 3.12. Other Pythons get the
+# newest versions. pyarrow 26 refuses NumPy 1.
 UBUNTU = {
     '3.12': ('numpy==1.26.4', 'scipy==1.11.4', 'pandas==2.1.4', 'numba==0.59.1', 'pyarrow<26'),
 }
-# Made by the set-up of the copy; with them a second run takes no time for it.
+# Created by the set-up of the copy; they are kept so that a second run needs no set-up.
 KEPT = ('.venv', 'build', 'install', 'log')
 
 
 def output(command: list[str | Path], text: str = '') -> str:
-    """Return what a command prints; raise `SetupError` if it fails."""
+    """Return the output of a command; raise `SetupError` if it fails."""
     try:
         done = subprocess.run(
             command, cwd=ROOT, env=clean_environment(), input=text, capture_output=True,
@@ -46,7 +46,7 @@ def version_of(python: str) -> str:
 
 
 def copy_tree(tree: Path) -> None:
-    """Put the files of the checkout into ``tree``, also those not committed yet."""
+    """Copy the files of the checkout into ``tree``, including uncommitted ones."""
     tree.mkdir(parents=True, exist_ok=True)
     for path in tree.iterdir():
         if path.name not in KEPT:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The first step: .venv, filled from requirements.lock and nothing else."""
+"""First step of the set-up: create .venv with the packages of requirements.lock only."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from pathlib import Path
 from tree import LOG, PYTHON, ROOT, VENV, SetupError, contents, digest, run, say
 
 LOCK = ROOT / 'requirements.lock'
-# Published as source only. Both are pure Python; they are built with the pinned
-# setuptools, so that none is fetched that the lock does not name.
+# Published as source only. Both are pure Python and are built with the pinned
+# setuptools, so that only the version in the lock file is downloaded.
 SOURCE_ONLY = ('empy', 'notify2')
 
 
 def wheels_key() -> str:
-    """Hash what .venv depends on; the paths too, because it cannot be moved."""
+    """Return the hash of all inputs of .venv, including paths, because it cannot be moved."""
     who = [sys.version, sys.base_prefix, str(ROOT)]
     return digest([x.encode() for x in who] + list(contents([LOCK, Path(__file__)])))
 
 
 def make_venv(log: Path) -> None:
-    """Create .venv anew.
+    """Create a new .venv.
 
-    It is never brought up to date in place: the ROS wheels carry a second set of
-    metadata, by which an installer takes half of what they brought for strangers.
+    It is never updated in place: the ROS wheels contain a second set of metadata,
+    so an installer does not recognise half of their files as installed by them.
     """
     shutil.rmtree(VENV, ignore_errors=True)
     problem = run([sys.executable, '-m', 'venv', VENV], log)
@@ -44,10 +44,10 @@ def locked(names: tuple[str, ...]) -> str:
 
 
 def install_wheels(log: Path) -> None:
-    """Put what the lock file names into .venv, and nothing else.
+    """Install the packages of the lock file into .venv, and nothing else.
 
-    uv needs a tenth of pip's time. It does not read pip's settings, so where a
-    plant's mirror or certificate is known to pip only, pip does it.
+    uv needs a tenth of pip's time but does not read pip's settings. So pip is tried if uv
+    fails, for example because only pip has the settings of a plant's mirror or certificate.
     """
     pip: list[str | Path] = [PYTHON, '-m', 'pip', '--disable-pip-version-check', '--no-input']
     pip += ['install', '--no-deps', '--require-hashes', '--only-binary', ':all:']
@@ -74,10 +74,10 @@ def install_wheels(log: Path) -> None:
 def repair_cmake() -> int:
     """Point the wheels' exported CMake targets at this Python; return how many files.
 
-    They carry the include paths of the machine that built the wheels, beside NumPy 2,
+    They contain the include paths of the machine that built the wheels with NumPy 2,
     and CMake refuses a path that does not exist. A file is replaced, never written in place:
-    it may be a hard link into the installer's cache. A second run finds nothing
-    to do, and nothing outside .venv is looked at.
+    it may be a hard link into the installer's cache. A second run changes nothing,
+    and only files in .venv are read.
     """
     builder = r'/opt/python/cp\d+-cp\d+'
     version = f'python{sys.version_info.major}.{sys.version_info.minor}'

@@ -4,7 +4,7 @@
 
 The Python interface, ``import valveflow_ros as vf``: `open_log`, `identify`, `diagnose`,
 `compare`, `validate`, `monitor`, `fleet`, `judge_loop`, `simulate`, `load_characteristic`. Its
-parts are loaded when they are first used.
+parts are loaded at their first use.
 """
 
 from typing import TYPE_CHECKING, Any

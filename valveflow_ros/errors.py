@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that can go wrong for a person, each as one sentence.
+"""The exceptions of the project, each with a message of one sentence.
 
-Every error the project raises on purpose derives from `ValveflowError`, and
-``str(error)`` is a sentence that says what was wrong, where, and what to do.
-The command line prints it and exits with status 1; the node logs it and goes
-on. Errors of other libraries are translated at the edge where they arise.
+Every error that the project raises on purpose derives from `ValveflowError`, and
+``str(error)`` is a sentence that says what is wrong, where, and what to do. The
+command line prints it and exits with status 1; the node logs it and continues.
+Errors of other libraries are converted where they are raised.
 """
 
 import math
@@ -14,19 +14,19 @@ from collections.abc import Sequence
 
 
 class ValveflowError(Exception):
-    """Root of all errors raised on purpose; its text is one sentence for a person."""
+    """Base class of all errors raised on purpose; its text is one sentence for the user."""
 
 
 class InputError(ValveflowError):
-    """An argument, option, column, unit or value given by a person cannot be used."""
+    """An argument, option, column, unit or value given by the user is invalid."""
 
 
 class UsageError(InputError):
-    """Arguments are of the wrong form or contradict each other, whatever the data hold."""
+    """Arguments have a wrong form or contradict each other, independent of the data."""
 
 
 class ParameterError(InputError):
-    """A parameter is unknown, of the wrong type, out of range, or at odds with another."""
+    """A parameter is unknown, of the wrong type, out of range, or contradicts another one."""
 
     def __init__(self, name: str, problem: str) -> None:
         self.name = name
@@ -44,11 +44,11 @@ class RecordingError(ValveflowError):
 
 
 class DataError(ValveflowError):
-    """The data are readable but do not carry what was asked of them."""
+    """The data are readable but do not permit the requested result."""
 
 
 class TooFewSamplesError(DataError):
-    """Fewer samples, or fewer distinct openings, than the task needs."""
+    """There are fewer samples or distinct openings than the task needs."""
 
     def __init__(self, what: str, have: int, need: int, advice: str = '') -> None:
         self.have = have
@@ -58,31 +58,31 @@ class TooFewSamplesError(DataError):
 
 
 def counted(number: float, one: str, many: str = '') -> str:
-    """Write a number and its noun for a sentence: '1 row', '3 rows', '0.5 days'."""
+    """Return a number with its noun for a sentence: '1 row', '3 rows', '0.5 days'."""
     told = str(number) if isinstance(number, int) else f'{number:g}'
     return f'{told} {one if told == "1" else many or one + "s"}'
 
 
 def listed(words: Sequence[str], last: str = 'and') -> str:
-    """Write words as a list for a sentence: 'a', 'a and b', 'a, b and c'."""
+    """Return words as a list for a sentence: 'a', 'a and b', 'a, b and c'."""
     return f' {last} '.join(filter(None, (', '.join(words[:-1]), *words[-1:])))
 
 
 def short(value: float, places: int = 0, sign: str = '') -> str:
-    """Write a number with so many decimals, and more where that leaves no two digits of it."""
+    """Return a number with the given decimals, or more if it would have fewer than two digits."""
     size = abs(value)
     if 0.0 < size < math.inf:
         places = max(places, 1 - math.floor(math.log10(size)))
     return f'{value:{sign}.{places}f}'
 
 
-# Compiled code ends the process without a word when it gets no memory. On two cores the engine
-# was loaded in 1 GiB of address space, and a log of a day identified in 2.4 GiB.
+# Compiled code ends the process without a message if it gets no memory. On two cores the engine
+# needed 1 GiB of address space to load, and 2.4 GiB to identify a log of one day.
 LOADING_BYTES, WORKING_BYTES = 1 << 30, 5 << 29
 
 
 def check_address_space(need: int) -> None:
-    """Refuse a limit of address space below ``need`` bytes; raises `ValveflowError`."""
+    """Raise `ValveflowError` if the limit of address space is below ``need`` bytes."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < need:
         raise ValveflowError(

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Flags of the compiler, threads, and long sums whose bits do not depend on either."""
+"""Compiler options, threads, and long sums whose result does not depend on the threads."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import numpy as np
 
 from valveflow_ros.records import FloatArray
 
-# No fastmath: it lets NaN disappear and reorders the sums that tests compare.
-# No wrapper for calls from C: nobody makes such calls, and each takes time to compile.
+# No fastmath: it assumes that there is no NaN, and reorders the sums that tests compare.
+# No wrapper for calls from C: it is not needed, and takes time to compile.
 JIT: dict[str, Any] = {'cache': True, 'nogil': True, 'no_cfunc_wrapper': True}
 
 _Function = TypeVar('_Function', bound=Callable[..., Any])
@@ -27,10 +27,10 @@ _USUAL_MW = 300.0
 
 
 def output_size(output: FloatArray) -> float:
-    """Return how large an output is beside that of a unit of 300 MW.
+    """Return the size of an output relative to that of a unit of 300 MW.
 
-    Steps of searches that are in MW are multiplied by it, so that they suit a unit of any size and
-    a flow in any unit. From 212 to 424 MW it is 1: there the steps are those that were tried.
+    Search steps in MW are multiplied by it, so that they suit a unit of any size and a flow in
+    any unit. From 212 to 424 MW it is 1: there the steps are those that were tested.
     """
     top = float(np.quantile(np.abs(output), 0.99)) if len(output) else 0.0
     size = top / _USUAL_MW
@@ -38,15 +38,15 @@ def output_size(output: FloatArray) -> float:
 
 
 def jit(function: _Function) -> _Function:
-    """Compile a loop over arrays, keeping its type for the checker."""
+    """Compile a loop over arrays; the type checker sees the original type."""
     return cast(_Function, _prepared(numba.njit(**JIT)(function)))
 
 
 def _prepared(compiled: Any) -> Any:
-    """Compile a function once for `f(x, 0)` and `f(x, n)`, and keep no outdated result.
+    """Compile a function once for `f(x, 0)` and `f(x, n)`, and use no outdated cache.
 
-    numba takes a constant in a call for a type of its own, and compiles the callee, and all that
-    it calls, again for each.
+    numba treats a constant argument as a separate type, and compiles the function and all
+    functions that it calls again for each constant.
     """
     call = getattr(compiled, 'get_call_template', None)
     if call is None:  # NUMBA_DISABLE_JIT
@@ -61,10 +61,10 @@ def _prepared(compiled: Any) -> Any:
 
 
 def _fresh(compiled: Any) -> Any:
-    """Let what was kept of a function be used only while nothing that it calls has changed.
+    """Use the cache of a function only if no function that it calls has changed.
 
-    numba looks at the function's own file alone: after an update it would go on with old loops of
-    other files, and it ends with an error where a type that it kept is called otherwise now.
+    numba checks the function's own file only: after an update it would use old loops of other
+    files, and it fails if a cached type has another name now.
     """
     cache = getattr(compiled, '_cache', None)
     kept = getattr(getattr(cache, '_cache_file', None), '_index_path', None)
@@ -75,14 +75,14 @@ def _fresh(compiled: Any) -> Any:
     def load_overload(signature: Any, context: Any) -> Any:
         try:
             kept_s, now_s = os.path.getmtime(kept), time.time()
-            # A file from the future, by a clock that was wrong, would always be newer.
+            # A file with a time in the future, from a wrong clock, would always be newer.
             if any(kept_s < os.path.getmtime(file) <= now_s for file in _sources(compiled)):
                 cache.flush()
         except OSError:
-            pass  # Nothing is kept, or there are no sources that could change.
+            pass  # There is no cache, or there are no sources that could change.
         try:
             return load(signature, context)
-        except Exception:  # noqa: BLE001 - numba raises what its pickles raise
+        except Exception:  # noqa: BLE001 - numba raises any error of its pickles
             cache.flush()
             return None
 
@@ -105,17 +105,17 @@ def _sources(compiled: Any) -> set[str]:
     return found
 
 
-# A division by zero gives inf or NaN here instead of an exception, whose test
-# would keep a loop from being turned into SIMD instructions.
+# A division by zero gives inf or NaN here. The test for an exception would prevent
+# the vectorisation of a loop.
 _KERNEL_JIT: dict[str, Any] = {**JIT, 'error_model': 'numpy'}
 
 
 def kernel(function: _Function) -> _Function:
-    """Compile a loop made for SIMD: like `jit`, with IEEE division."""
+    """Compile a loop that can be vectorised: like `jit`, with IEEE division."""
     return cast(_Function, _prepared(numba.njit(**_KERNEL_JIT)(function)))
 
 
-# Not callable from Python, which saves compiling a wrapper for each.
+# Not callable from Python: this saves the time to compile wrappers.
 _INLINED_JIT: dict[str, Any] = {
     **_KERNEL_JIT,
     'forceinline': True,
@@ -126,25 +126,25 @@ _INLINED_JIT: dict[str, Any] = {
 def inlined(function: _Function) -> _Function:
     """Compile a part of a `kernel` into its caller.
 
-    A call that hands over records of arrays costs more than a short loop does:
-    every array is passed as seven numbers and its reference count goes up and down.
+    A call with tuples of arrays takes longer than a short loop: every array is passed
+    as seven numbers, and its reference count is increased and decreased.
     """
     return cast(_Function, _prepared(numba.njit(**_INLINED_JIT)(function)))
 
 
-# Plain threads for kernels that release the interpreter lock.
+# Python threads for kernels that release the interpreter lock.
 
 T = TypeVar('T')
 _END = object()
-# How often a thread that waits for room looks whether it is still wanted.
+# Interval at which a thread that waits for space checks if it must stop.
 _LOOK_S = 0.2
 
 
 def cores() -> int:
-    """Return how many cores this process may use.
+    """Return the number of cores that this process may use.
 
-    ``NUMBA_NUM_THREADS`` sets a limit, as it does to the compiler's own threads: a monitor's
-    worker leaves all cores but one to others.
+    ``NUMBA_NUM_THREADS`` sets a limit, as for numba's own threads: a monitor's worker uses
+    one core only.
     """
     have = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
     told = os.environ.get('NUMBA_NUM_THREADS', '')
@@ -152,7 +152,7 @@ def cores() -> int:
 
 
 def runs(count: int, length: int) -> list[tuple[int, int]]:
-    """Cut ``range(count)`` into runs of at most ``length``, the last one first."""
+    """Divide ``range(count)`` into runs of at most ``length``, the last one first."""
     return [(first, min(first + length, count)) for first in range(0, count, length)][::-1]
 
 
@@ -161,10 +161,10 @@ def run_in_threads(
 ) -> None:
     """Call ``work(*task)`` for every task, on ``threads`` threads; 1 starts none.
 
-    Unlike the compiler's own parallel loops this may happen in several places
-    of a process at the same time, costs microseconds to start, and leaves no
-    pool behind that a fork would break. A task's error is raised here once all
-    threads have stopped.
+    In contrast to numba's parallel loops this can be used in several threads of a
+    process at the same time, starts in microseconds, and creates no thread pool
+    that a fork would break. An error of a task is raised here after all threads
+    have stopped.
     """
     waiting = list(tasks)
     todo = iter(waiting)
@@ -195,10 +195,10 @@ def run_in_threads(
 
 
 def read_ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
-    """Return the same items, made in a thread while the last ones are worked on.
+    """Yield the same items, produced in a thread while the caller processes earlier ones.
 
-    At most ``depth`` of them wait. Where there is one core, they are made when asked for. An
-    error comes where it would have come; who stops early stops the thread.
+    At most ``depth`` items wait. With one core, items are produced on request. An error is
+    raised at the same item as without a thread. Closing the iterator stops the thread.
     """
     return items if cores() < 2 else _made_ahead(items, depth)
 
@@ -221,7 +221,7 @@ def _made_ahead(items: Iterator[T], depth: int) -> Generator[T, None, None]:
             for item in items:
                 if not hand_over(item):
                     return
-        except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
+        except BaseException as error:  # noqa: BLE001 - raised again in the consumer
             hand_over(_END, error)
         else:
             hand_over(_END)
@@ -239,11 +239,11 @@ def _made_ahead(items: Iterator[T], depth: int) -> Generator[T, None, None]:
         unwanted.set()
 
 
-# Long sums that come out alike whatever the number of threads.
+# Long sums whose result does not depend on the number of threads.
 #
-# The linear algebra library splits long dot products over threads, so its last
-# bits depend on how many there are. A fit must give the same bits in the
-# worker of a live run and in a replay, so what runs over samples runs here.
+# The linear algebra library divides long dot products among threads, so the last
+# bits depend on the number of threads. A fit must give the same bits in the
+# worker of a live run and in a replay, so sums over samples are computed here.
 
 
 @jit
@@ -276,9 +276,9 @@ def product(table: FloatArray, matrix: FloatArray) -> FloatArray:
 
 @jit
 def running_average(values: FloatArray, forget: float) -> FloatArray:
-    """Return the exponential average of ``values`` (n,) after each, begun at zero, shape (n,).
+    """Return the exponential average after each of ``values`` (n,), starting at 0, shape (n,).
 
-    Each step keeps ``forget`` (0 to 1) of the average before.
+    Each step multiplies the previous average by ``forget`` (0 to 1).
     """
     out = np.empty(values.size)
     average = 0.0

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The one table of parameters: names, defaults, units, ranges, sentences.
+"""The table of all parameters: names, defaults, units, ranges, descriptions.
 
 The node declares its ROS parameters from this table, ``config/monitor.yaml``
-and the documentation are made from it, the command line reads a file against
-it, and the engine gets its settings from it. Values are checked one by one
-against their range and then together.
+and the documentation are generated from it, the command line checks parameter
+files with it, and the engine gets its settings from it. Each value is checked
+against its range, and then all values together.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from valveflow_ros.records import FLOW_UNITS, zone_of
 Value = bool | int | float | str
 
 
-# What the engine's decisions do not depend on.
+# Parameters without influence on the engine's decisions.
 _APART = frozenset({
     'autostart', 'input_reliability', 'refit_timeout', 'diagnosis_timeout', 'reference_file',
     'record', 'record_directory', 'record_flush', 'record_rotation', 'record_queue',
@@ -33,10 +33,10 @@ _APART = frozenset({
 
 
 class Depends(enum.IntEnum):
-    """What of a saved state is of no use with another value of a parameter.
+    """The part of a saved state that is invalid after a change of a parameter.
 
-    `SEGMENTS` are found anew in the rows of the window; with `ROWS` the window goes, and curve,
-    reference and alarms stay; `ALL` belongs to another unit, or to values in another unit.
+    `SEGMENTS` are found again in the rows of the window. With `ROWS` the window is dropped, and
+    curve, reference and alarms are kept. `ALL`: the state is of another unit or in other units.
     """
 
     NOTHING = 0
@@ -67,9 +67,9 @@ class Parameter:
     low, high : float, optional
         Inclusive range of a number.
     choices : tuple of str
-        The allowed words of a text; empty means any text.
+        The allowed values of a text; empty means any text.
     live : bool
-        Whether it may be changed while the monitor runs.
+        True if it may be changed while the monitor runs.
     """
 
     name: str
@@ -83,18 +83,18 @@ class Parameter:
 
     @property
     def of_state(self) -> bool:
-        """Tell whether the engine decides by it, and it may not change while the monitor runs."""
+        """Return True if the engine's decisions depend on it and it is fixed during a run."""
         return not (self.live or self.name in _APART)
 
     @property
     def depends(self) -> Depends:
-        """Return what of a saved state is of no use with another value."""
+        """Return the part of a saved state that is invalid after a change."""
         return _DEPENDS.get(self.name, Depends.NOTHING)
 
     def check(self, value: object) -> Value:
         """Return ``value`` in this row's type, or raise `ParameterError`.
 
-        A whole number is taken where a real one is wanted; NaN never passes.
+        An integer is accepted for a real number; NaN is never accepted.
         """
         if isinstance(self.default, bool):
             if isinstance(value, bool):
@@ -133,9 +133,9 @@ class Parameter:
 
 
 NOT_NOW = 'cannot be changed while the monitor runs; set it at the start, or after a clean-up'
-# YAML takes a bare % for the beginning of a directive.
+# In YAML an unquoted % begins a directive.
 _OPENING_UNITS = ('percent', '%', 'fraction')
-# Two names of one value: a state does not depend on which was given.
+# Convert alternative names of a value, so that states are equal for both.
 _SAME: dict[Value, Value] = {'%': 'percent'}
 _PRESSURE_UNITS = (
     'MPa', 'kPa', 'Pa', 'bar', 'mbar', 'psi', 'kg/cm2', 'MPag', 'kPag', 'barg', 'psig',
@@ -396,17 +396,17 @@ PARAMETERS: dict[str, Parameter] = {row.name: row for row in TABLE}
 
 
 class Settings(Mapping[str, Value]):
-    """A complete, checked set of parameter values; unchanging.
+    """A complete, checked set of parameter values; immutable.
 
     Parameters
     ----------
     values : mapping, optional
-        What differs from the defaults.
+        Values that differ from the defaults.
 
     Raises
     ------
     ParameterError
-        A name is unknown, a value does not fit its row, or two values are at odds.
+        A name is unknown, a value is invalid, or two values contradict each other.
     """
 
     __slots__ = ('_values',)
@@ -435,11 +435,11 @@ class Settings(Mapping[str, Value]):
         return float(self._values[name])
 
     def whole(self, name: str) -> int:
-        """Return a whole number."""
+        """Return an integer."""
         return int(self._values[name])
 
     def flag(self, name: str) -> bool:
-        """Return a switch."""
+        """Return a boolean."""
         return bool(self._values[name])
 
     def text(self, name: str) -> str:
@@ -447,16 +447,16 @@ class Settings(Mapping[str, Value]):
         return str(self._values[name])
 
     def changed(self, values: Mapping[str, object]) -> Settings:
-        """Return a copy with some values replaced, checked anew."""
+        """Return a checked copy with some values replaced."""
         return Settings({**self._values, **values})
 
     def live_changes(self, wanted: Settings) -> dict[str, Value]:
-        """Return what differs in ``wanted``.
+        """Return the values that differ in ``wanted``.
 
         Raises
         ------
         ParameterError
-            One differs that may not be changed while the monitor runs.
+            A value differs that may not be changed while the monitor runs.
         """
         changed = wanted.changes(self)
         for name in changed:
@@ -466,12 +466,12 @@ class Settings(Mapping[str, Value]):
 
     @classmethod
     def earlier(cls, values: Mapping[str, object]) -> Settings:
-        """Return the settings of an earlier version; what no longer exists or fits is left out.
+        """Return the settings of an earlier version without parameters that are invalid now.
 
         Raises
         ------
         ParameterError
-            Two values are at odds.
+            Two values contradict each other.
         """
         known: dict[str, object] = {}
         for name, value in values.items():
@@ -480,32 +480,32 @@ class Settings(Mapping[str, Value]):
         return cls(known)
 
     def changes(self, then: Mapping[str, Value]) -> dict[str, Value]:
-        """Return what had a value of another meaning ``then``, in the table's order."""
+        """Return the parameters with another effective value in ``then``, in the table's order."""
         return {n: v for n, v in self.items() if _SAME.get(v, v) != _SAME.get(then[n], then[n])}
 
     def retuned(self, then: Mapping[str, Value]) -> tuple[str, ...]:
-        """Return the names of those changes that are of `Parameter.of_state`."""
+        """Return the names of those changes with `Parameter.of_state`."""
         return tuple(n for n in self.changes(then) if parameter(n).of_state)
 
     @property
     def output_unit(self) -> str:
-        """The unit of the output after conversion: MW, or that of a flow."""
+        """Return the unit of the output after conversion: MW, or that of a flow."""
         unit = self.text('generated_power_unit')
         return unit if unit in FLOW_UNITS else 'MW'
 
     @property
     def zone(self) -> tzinfo | None:
-        """The zone in which people are told times; None: UTC."""
+        """Return the time zone of times in messages and pages; None: UTC."""
         return zone_of(self.text('time_zone'))
 
     @property
     def settle_s(self) -> float:
-        """The transient after a move begins, 5 T + tau (Table I of the paper)."""
+        """Return the transient after a move begins in s, 5 T + tau (Table I of the paper)."""
         return 5.0 * self.real('time_constant') + self.real('delay')
 
 
 def parameter(name: str) -> Parameter:
-    """Return the row called ``name``; the error names the nearest one."""
+    """Return the parameter ``name``; the error message names the most similar one."""
     row = PARAMETERS.get(name)
     if row is None:
         near = difflib.get_close_matches(str(name), PARAMETERS, n=1)
@@ -523,7 +523,7 @@ def _check_zone(name: str) -> None:
 
 
 def _check_together(values: Mapping[str, Value]) -> None:
-    """Refuse values that are each in range and yet at odds."""
+    """Raise `ParameterError` if valid values contradict each other."""
     _check_zone(str(values['time_zone']))
     for signal in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
                    'generated_power'):  # fmt: skip
@@ -564,7 +564,7 @@ def as_yaml(rows: Iterable[Parameter] = TABLE, values: Mapping[str, Value] | Non
     rows : iterable of Parameter
         Which rows to write.
     values : mapping, optional
-        Values other than the defaults.
+        Values that differ from the defaults.
     """
     lines = ['/**:', '  ros__parameters:']
     for row in rows:
@@ -588,7 +588,7 @@ def _yaml_scalar(value: Value) -> str:
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
     if isinstance(value, float):
-        # YAML 1.1 takes a number with an exponent but without a point for a text.
+        # In YAML 1.1 a number with an exponent but without a decimal point is a text.
         mantissa, exponent, power = repr(value).partition('e')
         return (mantissa if '.' in mantissa else mantissa + '.0') + exponent + power
     return str(value)

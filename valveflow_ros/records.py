@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The words every part of the house shares: signals, qualities, readings, samples, segments.
+"""Data types used in all packages: signals, qualities, readings, samples, segments.
 
-Records are frozen and slotted; arrays inside them are never written after the
-record was made. Units stand in the names; times are int64 nanoseconds since
-the Unix epoch.
+Records are frozen and slotted; arrays inside them are never changed after their
+creation. Names contain the units; times are int64 nanoseconds since the Unix
+epoch.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NS_PER_S = 1_000_000_000
 
 
 class Signal(enum.IntEnum):
-    """The five inputs, in the order in which tables hold them."""
+    """The five inputs, in the order of the columns of tables."""
 
     VALVE_OPENING = 0
     MAIN_STEAM_PRESSURE = 1
@@ -40,15 +40,15 @@ class Signal(enum.IntEnum):
 
 
 class Quality(enum.IntEnum):
-    """How far a value can be trusted; `logs.names.qualities` knows the codes of messages."""
+    """The quality of a value; `logs.names.qualities` converts the codes of messages."""
 
     GOOD = 0
     UNCERTAIN = 1
     BAD = 2
 
 
-# An output that is a flow keeps its unit: no factor turns tonnes into megawatts, and the engine
-# needs no certain unit. What is named ``_mw`` or told in MW is in this one then.
+# An output that is a flow keeps its unit: no factor converts tonnes to megawatts, and the engine
+# needs no specific unit. Values named ``_mw`` or described as MW then have this unit.
 FLOW_UNITS = (
     't/h', 'kg/h', 'kg/s', 'm3/h', 'Nm3/h', 'l/s', 'l/min', 'klb/h', 'lb/h', 'gpm', 'scfm',
 )  # fmt: skip
@@ -56,7 +56,7 @@ FLOW_UNITS = (
 
 @dataclass(frozen=True, slots=True)
 class SignalInfo:
-    """What a signal is called at the border and the unit the engine works in."""
+    """The external names of a signal and its unit in the engine."""
 
     signal: Signal
     topic: str
@@ -92,11 +92,11 @@ class Readings:
     time_ns : int64 (n,)
         The value's own time, nanoseconds since the Unix epoch.
     signal : int8 (n,)
-        Which `Signal` it is.
+        The `Signal` of the value.
     value : float64 (n,)
         In the engine's unit (%, MPa absolute, degC, MW); NaN means bad.
     quality : uint8 (n,)
-        A `Quality` as the sender gave it; `GOOD` where the sender gives none.
+        The `Quality` given by the sender; `GOOD` if the sender gives none.
     """
 
     time_ns: IntArray
@@ -110,7 +110,7 @@ class Readings:
 
     @classmethod
     def of(cls, rows: list[tuple[int, int, float, int]]) -> Readings:
-        """Build from rows ``(time_ns, signal, value, quality)``."""
+        """Create readings from rows ``(time_ns, signal, value, quality)``."""
         return cls(
             np.array([r[0] for r in rows], dtype=np.int64),
             np.array([r[1] for r in rows], dtype=np.int8),
@@ -124,7 +124,7 @@ class Readings:
         return Readings(self.time_ns[cut], self.signal[cut], self.value[cut], self.quality[cut])
 
     def by_signal(self) -> dict[int, Readings]:
-        """Return the readings of each signal that has any, in their order."""
+        """Return the readings by signal, in their order, without empty signals."""
         found = {}
         for info in SIGNALS:
             mine = np.flatnonzero(self.signal == info.signal)
@@ -137,16 +137,16 @@ class Readings:
 
 @dataclass(frozen=True, slots=True)
 class SampleTable:
-    """Rows on one time grid, the only form in which data reach the engine.
+    """Rows on one time grid, the only form of data for the engine.
 
     Attributes
     ----------
     time_ns : int64 (n,)
         Strictly increasing.
     values : float64 (n, 5)
-        Columns in the order of `Signal`, engine units; NaN where there is no usable value.
+        Columns in the order of `Signal`, engine units; NaN if there is no usable value.
     quality : uint8 (n, 5)
-        A `Quality` per value; `BAD` exactly where the value is NaN.
+        A `Quality` per value; `BAD` if and only if the value is NaN.
     """
 
     time_ns: IntArray
@@ -177,7 +177,7 @@ class SampleTable:
         columns: dict[Signal, FloatArray],
         quality: dict[Signal, ByteArray] | None = None,
     ) -> SampleTable:
-        """Build from one array a signal; a signal left out is NaN and `BAD`."""
+        """Create a table from one array per signal; other signals are NaN and `BAD`."""
         n = len(time_ns)
         values = np.full((n, N_SIGNALS), np.nan)
         codes = np.full((n, N_SIGNALS), int(Quality.BAD), dtype=np.uint8)
@@ -192,7 +192,7 @@ class SampleTable:
 
     @classmethod
     def concatenate(cls, tables: list[SampleTable]) -> SampleTable:
-        """Join tables that follow each other in time."""
+        """Join consecutive tables."""
         if not tables:
             return cls.from_columns(np.empty(0, dtype=np.int64), {})
         return cls(
@@ -203,12 +203,12 @@ class SampleTable:
 
 
 def table_to_readings(table: SampleTable) -> Readings:
-    """Turn rows into single readings, row by row.
+    """Convert rows into single readings, row by row.
 
-    The optional signal of a row comes first, so that who waits for the
-    required ones has it. Values that are NaN in an optional column are left
-    out (the signal is absent); a NaN in a required column stays, as a reading
-    of bad quality.
+    The optional signal of a row comes first, so that it is present when the
+    required ones are complete. NaN in an optional column is left out (the
+    signal is absent); NaN in a required column is kept as a reading of bad
+    quality.
     """
     n = len(table)
     order = np.array(sorted(range(N_SIGNALS), key=lambda s: SIGNALS[s].required), dtype=np.int8)
@@ -230,10 +230,10 @@ class SegmentKind(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class SpecialSegment:
-    """A stretch of samples that carries static information only.
+    """A stretch of samples that contains static information only.
 
     ``u`` is the integrated input V p^m in % MPa^m, eq. (1). Opening and pressure at its ends and
-    the exponent m are NaN where they are not known.
+    the exponent m are NaN if unknown.
     """
 
     number: int
@@ -265,7 +265,7 @@ def zone_of(name: str) -> tzinfo | None:
     Raises
     ------
     InputError
-        If there is no such zone.
+        There is no such zone.
     """
     text = name.strip()
     if text.upper() in ('', 'UTC', 'Z', 'GMT'):

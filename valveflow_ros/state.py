@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What an object that follows a stream remembers, as plain values.
+"""Saved states of objects that process a stream, as plain values.
 
-``snapshot()`` gives numbers, texts, lists, dicts and arrays that no longer change; ``restore()``
-puts them into a fresh object made with the same settings, which then goes on bit for bit as the
-first one would have. What does not fit is refused, since a state half believed is worse than none.
+``snapshot()`` returns numbers, texts, lists, dicts and copies of arrays. ``restore()`` writes them
+into a new object with the same settings, whose later results are then identical, bit for bit, to
+those of the first one. A state that does not fit is refused: a partial state would be worse.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from numpy.typing import NDArray
 from valveflow_ros.errors import DataError
 
 State = dict[str, Any]
-_LARGEST = 2**128  # a generator of random numbers has as many bits, and nothing has more
+_LARGEST = 2**128  # largest integer: that of the state of a random number generator
 
 
 class Memory:
-    """Remembers the attributes that `REMEMBERED` names, under their names without underscores.
+    """Save the attributes listed in `REMEMBERED`, under their names without underscores.
 
-    Arrays are copied out and written back in place; what has a memory of its own gives and takes
-    its own state; enumerations and named tuples come back as such; None stays None.
+    Arrays are copied and restored in place. An attribute that is a `Memory` saves and restores
+    its own state. Enumerations, named tuples and None keep their type.
     """
 
     REMEMBERED: ClassVar[tuple[str, ...]] = ()
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state to be saved."""
         return {name.lstrip('_'): _plain(getattr(self, name)) for name in self.REMEMBERED}
 
     def restore(self, saved: State) -> None:
-        """Go on from a state.
+        """Continue from a saved state.
 
         Raises
         ------
         DataError
-            It does not fit; the object is not to be used then.
+            The state does not fit; the object must not be used then.
         """
         own = {name.lstrip('_'): getattr(self, name) for name in self.REMEMBERED}
         put_back(
@@ -60,7 +60,7 @@ class Memory:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a state keeps it."""
+    """Return a value in the form of a state."""
     if isinstance(value, np.ndarray):
         return value.copy()
     if hasattr(value, 'snapshot'):
@@ -73,9 +73,9 @@ def _plain(value: Any) -> Any:
 
 
 def _of_kind(own: Any, saved: Any, key: str) -> Any:
-    """Return a saved value as the kind of value that an object has now."""
+    """Return a saved value with the type of the object's present value."""
     if isinstance(own, np.ndarray):
-        return own  # written in place
+        return own  # restored in place
     if hasattr(own, 'restore') != isinstance(saved, dict) or not _fits(own, saved, key):
         raise DataError(f"The saved state has '{key}' of another kind.")
     if hasattr(own, 'restore'):
@@ -92,9 +92,9 @@ def _of_kind(own: Any, saved: Any, key: str) -> Any:
 
 
 def _fits(own: Any, saved: Any, key: str) -> bool:
-    """Tell whether a saved value may stand in the place of the one that an object has now."""
+    """Return True if a saved value may replace the present value of an object."""
     if own is None:
-        # Of what is none yet the name tells that it is a time.
+        # If the present value is None, the name shows that it is a time.
         return not key.endswith('_ns') or saved is None or type(saved) is int
     if isinstance(own, bool | str):
         return isinstance(saved, type(own))
@@ -104,7 +104,7 @@ def _fits(own: Any, saved: Any, key: str) -> bool:
 
 
 def perhaps(saved: State, key: str, kind: type) -> Any:
-    """Return what stands under a key, None or of one kind; raises `DataError`."""
+    """Return the value of a key, None or of one type; raises `DataError`."""
     if saved[key] is not None and type(saved[key]) is not kind:
         raise DataError(f"The saved state has '{key}' of another kind.")
     return saved[key]
@@ -121,7 +121,7 @@ def put_back(arrays: Mapping[str, NDArray[Any]], saved: State) -> None:
     Raises
     ------
     DataError
-        One is missing, or of another type or shape.
+        An array is missing, or has another type or shape.
     """
     for name, array in arrays.items():
         given = saved.get(name)
@@ -136,11 +136,11 @@ def put_back(arrays: Mapping[str, NDArray[Any]], saved: State) -> None:
         np.copyto(array, saved[name])
 
 
-# A state as bytes that tell by themselves whether they are whole; nothing in them is executed.
+# A state as bytes with a checksum; reading it executes no code.
 
 FORMAT = b'valveflow-state'
 VERSION = 2
-_READ = (b'1', b'2')  # what differs in the parts of version 1 their owners know
+_READ = (b'1', b'2')  # version 1 is read, too: the owners of its parts convert them
 _ARRAY = '$array'
 _DIGEST = 64
 
@@ -151,7 +151,7 @@ def to_bytes(state: State) -> bytes:
     Parameters
     ----------
     state : dict
-        Of numbers, texts, lists, dicts with text keys, and arrays.
+        Contains numbers, texts, lists, dicts with text keys, and arrays.
     """
     arrays: list[NDArray[Any]] = []
     text = json.dumps(_flat(state, arrays), separators=(',', ':'))
@@ -164,12 +164,12 @@ def to_bytes(state: State) -> bytes:
 
 
 def from_bytes(data: bytes) -> State:
-    """Return the state in such bytes.
+    """Return the state in bytes from `to_bytes`.
 
     Raises
     ------
     DataError
-        They are cut off, changed, of another version, or something else altogether.
+        The bytes are incomplete, changed, of another version, or no state.
     """
     line, _, content = data.partition(b'\n')
     words = line.split(b' ')
@@ -186,7 +186,7 @@ def from_bytes(data: bytes) -> State:
             state = _full(tree, archive)
     except DataError:
         raise
-    except Exception as error:  # noqa: BLE001 - zip, numpy and json raise what they like
+    except Exception as error:  # noqa: BLE001 - zip, numpy and json raise many types
         reason = type(error).__name__
         raise DataError(f'The saved state cannot be read ({reason}).') from None
     if not isinstance(state, dict):
@@ -195,7 +195,7 @@ def from_bytes(data: bytes) -> State:
 
 
 def _flat(value: Any, arrays: list[NDArray[Any]]) -> Any:
-    """Return a value with its arrays put aside."""
+    """Return a value with its arrays moved to a separate list."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
         return {_ARRAY: len(arrays) - 1}
@@ -209,7 +209,7 @@ def _flat(value: Any, arrays: list[NDArray[Any]]) -> Any:
 
 
 def _full(value: Any, archive: Any) -> Any:
-    """Return a value with its arrays back in place."""
+    """Return a value with its arrays inserted again."""
     if isinstance(value, dict):
         if value.keys() == {_ARRAY}:
             return archive[f'a{int(value[_ARRAY])}']

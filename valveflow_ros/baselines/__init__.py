@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The methods the paper compares with, and how models are judged on other data."""
+"""The methods with which the paper compares, and the test of models on other data."""

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of Section IV of the paper: three methods on one log, judged on another."""
+"""The comparison of Section IV of the paper: three methods on one log, tested on another."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _LEVEL = 0.05
 
 
 class Terms(enum.Enum):
-    """What is compared with what."""
+    """The kinds of predictions that are compared."""
 
     AS_PAPER = 'as the paper'
     STATIC = 'curve against curve, steady-state segments'
@@ -49,7 +49,7 @@ class Terms(enum.Enum):
 
 
 class ErrorOrder(enum.Enum):
-    """Which of two has the smaller squared error."""
+    """Which of two methods has the smaller squared error."""
 
     BETTER = 'better'
     WORSE = 'worse'
@@ -57,7 +57,7 @@ class ErrorOrder(enum.Enum):
 
 
 class Finding(enum.Enum):
-    """What becomes of the paper's finding."""
+    """Whether the paper's finding is confirmed."""
 
     CONFIRMED = 'confirmed'
     CONTRADICTED = 'contradicted'
@@ -75,11 +75,11 @@ class Pair:
         Names of the predictions.
     mse_ours_mw2, mse_theirs_mw2 : float
     test : PairedTest
-        Of the difference of squared errors, theirs less ours, over segments or blocks.
+        Of the difference of squared errors, theirs minus ours, over segments or blocks.
     failed : int
-        Segments or blocks in which theirs is not finite; the test leaves them out.
+        Number of segments or blocks in which theirs is not finite; the test omits them.
     judged : int
-        All segments or blocks, those among them.
+        Number of all segments or blocks, including the failed ones.
     """
 
     terms: Terms
@@ -93,15 +93,15 @@ class Pair:
 
     @property
     def baseline(self) -> str:
-        """Return the method it is compared with."""
+        """Return the other method."""
         return self.theirs.partition('.')[0]
 
     @property
     def outcome(self) -> ErrorOrder:
-        """Return who is better at the 5 % level.
+        """Return which method is better at the 5 % level.
 
-        Where the test tells nothing, theirs loses only if it mostly gives no answer: a few
-        segments without one are no evidence about the others.
+        Without a significant difference theirs loses only if it is mostly not finite: a few
+        such segments are no evidence for the others.
         """
         if not self.test.zero_is_rejected(_LEVEL):
             return ErrorOrder.BETTER if 2 * self.failed > self.judged else ErrorOrder.OPEN
@@ -113,9 +113,9 @@ def pairs_on_segments(
 ) -> tuple[Pair, ...]:
     """Compare the proposed method with both others on special segments.
 
-    As the paper does it: the static curve of the special segments against the others'
-    simulations. And on equal terms: simulation against simulation, and curve against curve
-    where the power rests, since on a ramp it lags behind any curve.
+    As in the paper, the static curve is compared with the others' simulations on the special
+    segments. In addition, simulation is compared with simulation, and curve with curve in
+    steady-state segments, because on a ramp the power lags behind any curve.
     """
     paper = 'paper' if 'paper.static' in predictions else 'proposed'
     met = [
@@ -144,7 +144,7 @@ def pairs_on_segments(
 def everywhere(
     trial: Trial, predictions: Mapping[str, FloatArray]
 ) -> tuple[dict[str, float], tuple[Pair, ...]]:
-    """Judge simulations on all rows; test over blocks of half an hour.
+    """Compare simulations on all rows, with tests over blocks of half an hour.
 
     Returns
     -------
@@ -180,10 +180,10 @@ def everywhere(
 
 
 def finding_of(pairs: Iterable[Pair]) -> Finding:
-    """Return what becomes of the finding that the proposed curve beats both others.
+    """Return whether the proposed curve is better than both others, as the paper finds.
 
-    Judged as the paper does, on special segments of other data. One baseline that does
-    better contradicts it; both must do worse to confirm it, so both must be there.
+    The test is that of the paper, on special segments of other data. One better baseline
+    contradicts the finding. Both must exist and be worse to confirm it.
     """
     met = [(p.baseline, p.outcome) for p in pairs if p.terms is Terms.AS_PAPER]
     outcomes = {outcome for _, outcome in met}
@@ -195,12 +195,12 @@ def finding_of(pairs: Iterable[Pair]) -> Finding:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What came out.
+    """The result of the comparison.
 
     Attributes
     ----------
     characteristic : Characteristic
-        Of the proposed method.
+        The curve of the proposed method.
     hammerstein : HammersteinFit
     sparse : SparseFit or None
     failure : str
@@ -209,15 +209,15 @@ class Comparison:
         Curves with pieces: 'paper' (the exact partition of the special segments, as the
         paper fits it), 'proposed' (this program's) and 'hammerstein'.
     predictions : mapping of float64 (n,)
-        On the other data, in MW: each method's '.static' curve and its '.dynamic' simulation.
+        For the other data, in MW: the '.static' curve and '.dynamic' simulation of each method.
     trial : Trial
     judgement : Judgement
     all_rows : mapping
-        Mean squared error in MW^2 of the simulations over every row that can be judged.
+        Mean squared error in MW^2 of the simulations over all rows that can be used.
     pairs : tuple of Pair
-        Who is better than whom, and on what terms.
+        The pairwise comparisons.
     errors : mapping of CurveError
-        Against the truth, by method; empty if it is not known.
+        Errors relative to the truth, by method; empty if it is unknown.
     truth : Truth or None
     """
 
@@ -253,12 +253,12 @@ def compare(
     truth: Truth | None = None,
     progress: Progress = lambda _share, _what: None,
 ) -> Comparison:
-    """Identify by the two methods of the literature and judge all on other data.
+    """Identify with the two methods of the literature and test all methods on other data.
 
     Parameters
     ----------
     learn : Samples
-        The rows ``characteristic`` was identified from; the other methods use them all.
+        The rows from which ``characteristic`` was identified; the other methods use all of them.
     characteristic : Characteristic
     other : OtherData
     truth : Truth, optional
@@ -266,7 +266,7 @@ def compare(
     Raises
     ------
     DataError
-        A method finds no model in the data, or the other data hold nothing to judge by.
+        A method finds no model in the data, or the other data cannot be used for a test.
     """
     if (
         truth is not None
@@ -322,7 +322,7 @@ def _predictions(
     sparse: SparseFit | None,
     samples: Samples,
 ) -> dict[str, FloatArray]:
-    """Return each method's curve along the input, and its simulation."""
+    """Return the curve of each method at the input, and its simulation."""
     found = {f'{name}.static': line(samples.u) for name, line in lines.items()}
     if characteristic.dynamics:
         found['proposed.dynamic'] = dynamic(characteristic, samples)
@@ -337,7 +337,7 @@ def _predictions(
 
 
 def line_of(pieces: tuple[Piece, ...]) -> Line:
-    """Return pieces as a curve; between pieces that do not touch the left one goes on."""
+    """Return pieces as a curve; the left piece is extended up to the next one."""
     return Line(
         np.array([pieces[0].u_from, *(p.u_to for p in pieces)]),
         np.array([p.slope for p in pieces]),
@@ -349,7 +349,7 @@ def _errors(
     characteristic: Characteristic, lines: Mapping[str, Line], sparse: SparseFit | None,
     truth: Truth | None,
 ) -> dict[str, CurveError]:  # fmt: skip
-    """Return how far each curve is from the truth where the proposed one is known."""
+    """Return the error of each curve relative to the truth in the range of the proposed curve."""
     if truth is None:
         return {}
     ends = float(characteristic.breakpoints[0]), float(characteristic.breakpoints[-1])
@@ -360,7 +360,7 @@ def _errors(
 
 
 def to_json(c: Comparison) -> dict[str, Any]:
-    """Return the content of ``comparison.json``, without the words."""
+    """Return the content of ``comparison.json``, without the texts."""
     return {
         'format': FORMAT,
         'version': VERSION,
@@ -433,16 +433,16 @@ def _methods_json(c: Comparison) -> dict[str, Any]:
     return methods
 
 
-# What the JSON of a comparison and that of a validation have in common.
+# Common parts of the JSON of a comparison and of a validation.
 
 
 def number(value: float) -> float | None:
-    """Return a number for JSON, which has neither NaN nor infinity: absent is null."""
+    """Return a number for JSON; None for NaN and infinity, which JSON does not have."""
     return float(value) if math.isfinite(value) else None
 
 
 def fields_json(value: Any, **renamed: str) -> dict[str, Any]:
-    """Return the fields of a dataclass of numbers, some under another name."""
+    """Return the fields of a dataclass of numbers, some of them renamed."""
     return {renamed.get(f.name, f.name): number(getattr(value, f.name)) for f in fields(value)}
 
 
@@ -466,7 +466,7 @@ def totals_json(judgement: Judgement, names: Iterable[str]) -> dict[str, Any]:
 
 
 def judged_json(judgement: Judgement) -> dict[str, Any]:
-    """Return what was judged, and each special segment with the scores of all predictions."""
+    """Return a summary, and each special segment with the scores of all predictions."""
     return {
         'judged': {
             'segments': len(judgement.segments),

@@ -1,12 +1,12 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A Hammerstein model, and its identification as its literature does it.
+"""A Hammerstein model, and its identification as in the literature.
 
-Piecewise-linear input, one linear block for all loads. Knots, values and the block are
-estimated together by the prediction error over all rows: what ``nlhw`` of the System
-Identification Toolbox does, to which the paper compares (Section IV). Starts come from several
-sets of knots; orders and delay are searched; orders and the model of the noise are chosen by how
-well the last part of the identification data is simulated from the first.
+It has a piecewise-linear input and one linear block for all loads. Knots, values and the block
+are estimated together from the prediction error over all rows, as in ``nlhw`` of the System
+Identification Toolbox, with which the paper compares (Section IV). The fit starts from several
+sets of knots and searches orders and delay. Orders and noise model are chosen by the simulation
+error on the last part of the identification data after a fit to the first part.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from valveflow_ros.records import ByteArray, FloatArray
 def _slopes_of_curve(
     u: float, knots: FloatArray, values: FloatArray, share: float, gains: FloatArray
 ) -> None:
-    """Add ``share`` times the derivatives of F(u): J + 1 values, then J - 1 inner knots."""
+    """Add ``share`` times the derivatives of F(u) by J + 1 values, then by J - 1 inner knots."""
     pieces = knots.size - 1
     k = piece_of(u, knots)
     width = knots[k + 1] - knots[k]
@@ -55,7 +55,7 @@ def _push(
 ) -> None:  # fmt: skip
     """Advance the derivatives by row ``t`` and add them to ``sums``.
 
-    ``gains`` takes what flow and past power add, ``lag`` the derivatives behind the poles.
+    ``gains`` receives the terms of flow and past power, ``lag`` the derivatives after the poles.
     """
     n_curve = 2 * (knots.size - 1)
     gains[:] = 0.0
@@ -80,7 +80,7 @@ def _push(
 @jit
 def _next(flow: FloatArray, b: FloatArray, f: FloatArray, past: FloatArray, t: int, delay: int,
           age: int) -> float:  # fmt: skip
-    """Advance the linear block by one row; ``past`` takes the new power in front."""
+    """Advance the linear block by one row; the new power is inserted at the front of ``past``."""
     state = 0.0
     for j in range(b.size):
         state += b[j] * flow[t - min(delay + j, age)]
@@ -106,9 +106,9 @@ def run_with_tangents(
     knots, values : (J + 1,)
     b : (n_b,), f : (n_f,)
     answer : (m,), jacobian : (m, P), weight : (m,)
-        Written. P = (J + 1) + (J - 1) + n_f + (n_b - 1): values, inner knots, f, b_1 and on
-        (or fewer columns: the first so many of these). ``weight`` is 1 where all rows of the
-        mean are usable and settled.
+        Outputs. P = (J + 1) + (J - 1) + n_f + (n_b - 1): values, inner knots, f, b_1 and following
+        (or only the first columns of these). ``weight`` is 1 if all rows of the mean are usable
+        and settled.
     """
     columns = jacobian.shape[1]
     n_curve = 2 * (knots.size - 1)
@@ -154,15 +154,15 @@ class HammersteinModel:
     Attributes
     ----------
     knots : float64 (J + 1,)
-        % MPa^m; beyond the outer ones the outer pieces go on.
+        % MPa^m; the outer pieces extend beyond the outer ones.
     values : float64 (J + 1,)
         MW at the knots.
     numerator : float64 (n_b - 1,)
-        b_1 and on; b_0 makes the static gain 1.
+        b_1 and following; b_0 makes the static gain 1.
     denominator : float64 (n_f,)
-        f_1 and on, after the leading 1.
+        f_1 and following, after the leading 1.
     delay : int
-        Rows.
+        Delay in rows.
     step_s : float
     """
 
@@ -180,7 +180,7 @@ class HammersteinModel:
 
     @property
     def b(self) -> FloatArray:
-        """Return b_0 and on, shape (n_b,)."""
+        """Return b_0 and following, shape (n_b,)."""
         first = 1.0 + self.denominator.sum() - self.numerator.sum()
         return np.concatenate([[first], self.numerator])
 
@@ -210,9 +210,9 @@ class HammersteinModel:
         return bool(np.all(np.abs(poles) < 1.0 - 1e-6))
 
     def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
-        """Return the simulated power in MW and where it has settled, shapes (n,).
+        """Return the simulated power in MW and a mask of settled rows, shapes (n,).
 
-        After a gap the block starts in equilibrium; in a gap the power is NaN.
+        After a gap the block starts in steady state; in a gap the power is NaN.
         """
         answer, _, settled = self.averaged(replace(samples, group=1), columns=0)
         return np.where(samples.usable > 0, answer, np.nan), settled
@@ -222,7 +222,7 @@ class HammersteinModel:
     ) -> tuple[FloatArray, FloatArray, ByteArray]:
         """Return means of the simulated power (m,), its derivatives (m, P) and the weight (m,).
 
-        ``columns`` asks for only the first so many derivatives.
+        ``columns`` is the number of first derivatives to return.
         """
         m = samples.means
         answer, weight = np.empty(m), np.empty(m, dtype=np.uint8)
@@ -258,7 +258,7 @@ def tangents(
     Parameters
     ----------
     columns : int, optional
-        Only the first so many derivatives.
+        Number of first derivatives to compute; default all.
     """
     answer, jacobian, weight = model.averaged(samples, columns)
     power = samples.power_mw[: samples.means * samples.group]
@@ -269,12 +269,12 @@ def tangents(
 # The identification.
 
 OUTPUT_ERROR: FloatArray = np.empty(0)
-_NARROWEST = 0.004  # of the range of u: as narrow as the proposed method lets a piece be
+_NARROWEST = 0.004  # of the range of u: minimum width of a piece, as in the proposed method
 _DELAY_STEPS_S = (8.0, 4.0, 2.0, 1.0)
-# Where the search begins: least squares on a grid.
+# Initial models: least squares on a grid.
 _GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 _GRID_DELAY_S = (0.0, 5.0, 15.0, 30.0)
-_SEED = 20240229  # of the random knots; a fit is a pure function of its data
+_SEED = 20240229  # seed of the random knots, so that a fit depends on its data only
 _RANDOM_STARTS = 4
 _LEAST_PART = 0.05
 _KEPT_STARTS = 3
@@ -287,12 +287,12 @@ Progress = Callable[[str], None]
 def move(
     samples: Samples, model: HammersteinModel, ar: FloatArray, steps: int
 ) -> tuple[HammersteinModel, float]:
-    """Levenberg-Marquardt over values, knots and both polynomials, the delay held.
+    """Fit values, knots and both polynomials by Levenberg-Marquardt with a fixed delay.
 
     Parameters
     ----------
     ar : float64 (k,)
-        Of the noise of the means; empty is the output error, which calls all noise white.
+        AR model of the noise of the means; empty for the output error model (white noise).
     """
 
     def cost(model: HammersteinModel) -> float:
@@ -316,7 +316,7 @@ def move(
 def search_delay(
     samples: Samples, model: HammersteinModel, ar: FloatArray, best: float, steps: int = 4
 ) -> tuple[HammersteinModel, float]:
-    """Move the delay by whole rows, everything else refitted, while that helps."""
+    """Change the delay by whole rows, with a refit, as long as the error decreases."""
     rows = sorted({max(1, round(s / model.step_s)) for s in _DELAY_STEPS_S}, reverse=True)
     for size in rows:
         for sign in (1, -1):
@@ -330,11 +330,11 @@ def search_delay(
 
 
 def knots_to_try(u: FloatArray, pieces: int) -> list[FloatArray]:
-    """Return sets of J + 1 knots over the range of ``u``: even, by quantiles, at random."""
+    """Return sets of J + 1 knots over the range of ``u``: uniform, quantiles, random."""
     low, high = float(u.min()), float(u.max())
     even = np.linspace(low, high, pieces + 1)
     by_share = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1))
-    # Quantiles that are nowhere closer than a twentieth of an even spacing.
+    # Quantiles with a minimum distance of a twentieth of a uniform spacing.
     widths = np.maximum(np.diff(by_share), 0.05 * (high - low) / pieces)
     inner = low + (high - low) * np.cumsum(widths / widths.sum())[:-1]
     tried = [even, 0.5 * (even + by_share), np.concatenate([[low], inner, [high]])]
@@ -365,19 +365,19 @@ def with_best_values(samples: Samples, model: HammersteinModel) -> tuple[Hammers
     zero = replace(model, values=np.zeros_like(model.values))
     residual, jacobian, weight = tangents(samples, zero, columns=model.pieces + 1)
     sums = gram(whitened(np.column_stack([jacobian, residual]), weight, np.empty(0)))
-    # A knot without samples beside it is not told by the data; it then takes the least value.
+    # A knot without samples nearby is not determined by the data: use the minimum-norm solution.
     values = np.linalg.pinv(sums[:-1, :-1], rcond=1e-10, hermitian=True) @ sums[:-1, -1]
     left = float(sums[-1, -1] - values @ sums[:-1, -1])
     return replace(model, values=values), left
 
 
 def starts(samples: Samples, pieces: int) -> list[HammersteinModel]:
-    """Return one start for each set of knots, the best of the grid of (T, tau), best first.
+    """Return the best model of the (T, tau) grid for each set of knots, best first.
 
     Parameters
     ----------
     samples : Samples
-        May be coarse.
+        May be averaged rows.
     """
     u = samples.u[samples.usable > 0]
     found = []
@@ -392,14 +392,14 @@ def starts(samples: Samples, pieces: int) -> list[HammersteinModel]:
 
 @dataclass(frozen=True, slots=True)
 class HammersteinFit:
-    """The model and how it was chosen.
+    """The model and the evidence for its choice.
 
     Attributes
     ----------
     model : HammersteinModel
     noise : str
         'output error' or 'autoregressive'.
-    tried : tuple of (n_b, n_f, noise, mean squared error in MW^2 on the part held out)
+    tried : tuple of (n_b, n_f, noise, mean squared error in MW^2 on the held-out part)
     """
 
     model: HammersteinModel
@@ -415,7 +415,7 @@ def fit_hammerstein(
     Raises
     ------
     TooFewSamplesError
-        Too few rows lie far enough behind a gap.
+        Too few rows are far enough after a gap.
     """
     learn, judge = cut_samples(samples)
     progress('Hammerstein model: starts')
@@ -431,7 +431,7 @@ def fit_hammerstein(
 
 
 def _at_coarse(samples: Samples, pieces: int) -> HammersteinModel:
-    """Return the best of several starts, moved on coarse rows, at the step of the rows."""
+    """Return the best of several starts, fitted on averaged rows, at the step of the rows."""
     coarse = samples.coarser()
     moved = [move(coarse, s, OUTPUT_ERROR, 15) for s in starts(coarse, pieces)[:_KEPT_STARTS]]
     model, _ = min(moved, key=lambda pair: pair[1])
@@ -443,7 +443,7 @@ def _at_coarse(samples: Samples, pieces: int) -> HammersteinModel:
 
 
 def _orders(samples: Samples, model: HammersteinModel) -> list[tuple[str, HammersteinModel]]:
-    """Return a model of each order, each begun at the one before, under both noises."""
+    """Return a model of each order with both noise models; each fit starts from the last one."""
     found: list[tuple[str, HammersteinModel]] = []
     for n_b, n_f in ORDERS:
         model, best = move(samples, grown(model, n_b, n_f), OUTPUT_ERROR, 12)
@@ -454,13 +454,13 @@ def _orders(samples: Samples, model: HammersteinModel) -> list[tuple[str, Hammer
 
 
 def _whitened(samples: Samples, model: HammersteinModel) -> HammersteinModel:
-    """Refit under an AR model of the noise, which is far from white."""
+    """Refit with an AR model of the noise, which is far from white."""
     residual, _, weight = tangents(samples, model, columns=0)
     return move(samples, model, fit_ar(residual, weight), 8)[0]
 
 
 def grown(model: HammersteinModel, n_b: int, n_f: int) -> HammersteinModel:
-    """Add taps and poles that change nothing yet: a tap of 0, or a pole on a zero."""
+    """Add taps and poles without changing the model: a tap of 0, or a pole on a zero."""
     b, f = model.b, np.concatenate([[1.0], model.denominator])
     while len(f) - 1 < n_f and len(b) < n_b:
         f, b = np.convolve(f, [1.0, -_NEW_POLE]), np.convolve(b, [1.0, -_NEW_POLE])

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Judge predictions on special segments: squared errors and tests (Table III of the paper)."""
+"""Errors and tests of predictions on special segments (Table III of the paper)."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.static_form import PAPER_EXPONENT, StaticForm
 
 _LONGEST_S = 300.0
-_LEAST_ROWS = 10  # of a segment that can be judged
+_LEAST_ROWS = 10  # minimum number of rows of a segment
 LEARN_SHARE = 0.7
-_LEAST_OF_PART = 0.1  # of the settled rows needed altogether, in each part
+_LEAST_OF_PART = 0.1  # fraction of the required settled rows, in each part
 
 
-# Is a mean difference zero? The paper's test takes each sample of a segment for independent (its
-# reference [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that
-# test sees ten or a hundred times the evidence there is. Beside it stand tests that count what
-# the samples are worth.
+# Tests for a zero mean difference. The paper's test assumes independent samples in a segment (its
+# reference [38]). At 1 Hz the noise of the power is correlated over a minute or more, so that test
+# overestimates the evidence by a factor of ten or a hundred. In addition there are tests with the
+# effective number of samples.
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class PairedTest:
     p_value : float
         Two-sided.
     effective : float
-        Number of independent values the data are worth; degrees of freedom are one less.
+        Effective number of independent values; the degrees of freedom are one less.
     """
 
     mean: float
@@ -56,19 +56,19 @@ class PairedTest:
     effective: float
 
     def interval(self, level: float = 0.05) -> tuple[float, float]:
-        """Return the range the mean lies in with confidence 1 - ``level``; NaN if not known."""
+        """Return the confidence interval of the mean at 1 - ``level``; NaN if unknown."""
         if not (math.isfinite(self.stderr) and self.effective > 1.0):
             return math.nan, math.nan
         reach = float(stdtrit(self.effective - 1.0, 1.0 - 0.5 * level)) * self.stderr
         return self.mean - reach, self.mean + reach
 
     def zero_is_rejected(self, level: float = 0.05) -> bool:
-        """Return True if zero is ruled out; a test that could not be done rules nothing out."""
+        """Return True if a zero mean is rejected; False if the test is impossible."""
         return self.p_value < level
 
 
 def _test(mean: float, stderr: float, effective: float) -> PairedTest:
-    """Return the t test of a mean with its standard error; NaN where it cannot be done."""
+    """Return the t test of a mean with its standard error; NaN if it is impossible."""
     if not (math.isfinite(mean) and math.isfinite(stderr) and effective > 1.0):
         return PairedTest(mean, math.nan, math.nan, math.nan, effective)
     if stderr == 0.0:
@@ -79,18 +79,18 @@ def _test(mean: float, stderr: float, effective: float) -> PairedTest:
 
 
 def over_samples(difference: FloatArray, widening: float = 1.0) -> PairedTest:
-    """Test the samples of a segment; as the paper does, each counts.
+    """Test the samples of a segment; by default all are independent, as in the paper.
 
     Parameters
     ----------
     difference : float64 (n,)
     widening : float
-        How many times the variance of a long mean exceeds that of independent samples: the
-        test then counts n / widening of them.
+        Ratio of the variance of a long mean to that of independent samples: the
+        effective number of samples is n / widening.
 
     Notes
     -----
-    A stretch that is worth fewer than two values gives no verdict (NaN).
+    The result is NaN if the effective number is below two.
     """
     n = len(difference)
     effective = n / max(widening, 1.0)
@@ -106,12 +106,12 @@ def over_blocks(blocks: FloatArray) -> PairedTest:
     Parameters
     ----------
     blocks : float64 (k,)
-        In order of time; one value a block, such as a segment.
+        One value per block (for example a segment), in chronological order.
 
     Notes
     -----
     The variance is that of Newey and West with Bartlett weights over
-    ``4 (k / 100)^(2/9)`` lags; it may widen the ordinary one, never narrow it.
+    ``4 (k / 100)^(2/9)`` lags, but at least the ordinary variance.
     """
     k = len(blocks)
     if k < 2:
@@ -128,21 +128,21 @@ def over_blocks(blocks: FloatArray) -> PairedTest:
 
 
 def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
-    """Return how many times correlation in time widens the variance of a mean.
+    """Return the factor by which correlation in time increases the variance of a mean.
 
     Parameters
     ----------
     residual : float64 (n,)
     spans : int64 (k, 2)
-        First and end row of the stretches that count; rows of different stretches are
-        not taken for neighbours.
+        First and end row of the stretches to use; rows of different stretches are
+        not neighbours.
     step_s : float
 
     Notes
     -----
-    The stretches are pooled, about their common mean: about its own mean each would
-    look less correlated than it is. So a misfit that changes from stretch to stretch
-    counts as correlation, on the cautious side.
+    The stretches are pooled with a common mean: with its own mean each would seem less
+    correlated than it is. A misfit that changes from stretch to stretch is therefore
+    taken as correlation, which is conservative.
     """
     if not len(spans):
         return 1.0
@@ -158,7 +158,7 @@ def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class OtherData:
-    """Data no method has seen.
+    """Data that no method has used for fitting.
 
     Attributes
     ----------
@@ -178,12 +178,12 @@ class OtherData:
     exponent: float = PAPER_EXPONENT
 
     def on_axis(self, form: StaticForm) -> OtherData:
-        """Return the data with the u and the p^e that a curve of this form is a function of.
+        """Return the data with the u and the p^e of a curve of this form.
 
         Raises
         ------
         DataError
-            That is another u, and the openings are not known.
+            The form needs another u, and the openings are unknown.
         """
         s, opening = self.samples, self.opening_percent
         if form == StaticForm(exponent=self.exponent):
@@ -203,15 +203,15 @@ class OtherData:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Measured data to judge by.
+    """Measured data for the test.
 
     Attributes
     ----------
     time_ns : int64 (n,)
     u, power_mw : float64 (n,)
     good : bool (n,)
-        Rows every prediction is judged on: measured, inside the identified range of u,
-        and far enough behind a gap.
+        Rows used for the test of every prediction: measured, inside the identified range
+        of u, and far enough after a gap.
     spans : int64 (k, 3)
         Special segments as first row, end row and kind.
     step_s : float
@@ -227,14 +227,14 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One prediction on one segment.
+    """The error of one prediction on one segment.
 
     Attributes
     ----------
     mse_mw2 : float
-        Mean squared error; not finite where the prediction is not.
+        Mean squared error; not finite if the prediction is not.
     samples : PairedTest
-        Of measured minus predicted, each sample counting, as in the paper.
+        Of measured minus predicted, with independent samples, as in the paper.
     effective : PairedTest
         The same with the effective number of samples.
     """
@@ -251,15 +251,15 @@ class JudgedSegment:
     Attributes
     ----------
     number : int
-        From 1, in order of time.
+        From 1, in chronological order.
     kind : SegmentKind
     start_ns, end_ns : int
     rows : int64 (m,)
-        That were judged.
+        Indices of the rows that were used.
     power_mw : float
         Mean measured power.
     scores : mapping
-        By prediction.
+        Scores by prediction.
     """
 
     number: int
@@ -273,15 +273,15 @@ class JudgedSegment:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """All segments.
+    """The test of all segments.
 
     Attributes
     ----------
     segments : tuple of JudgedSegment
     widening : float
-        Samples that are worth one independent sample.
+        Number of samples equivalent to one independent sample.
     outside : int
-        Samples of special segments not judged: beyond the curve, or too near a gap.
+        Number of omitted samples of special segments: outside the curve, or too near a gap.
     """
 
     segments: tuple[JudgedSegment, ...]
@@ -290,7 +290,7 @@ class Judgement:
 
     @property
     def samples(self) -> int:
-        """Return the number of samples judged."""
+        """Return the number of samples used."""
         return sum(len(s.rows) for s in self.segments)
 
     def kinds(self, kind: SegmentKind | None) -> tuple[JudgedSegment, ...]:
@@ -298,7 +298,7 @@ class Judgement:
         return tuple(s for s in self.segments if kind is None or s.kind == kind)
 
     def mse(self, name: str, kind: SegmentKind | None = None) -> float:
-        """Return the mean squared error over all samples judged, MW^2; NaN without any."""
+        """Return the mean squared error over all samples used, MW^2; NaN without any."""
         chosen = self.kinds(kind)
         total = sum(len(s.rows) for s in chosen)
         errors = (s.scores[name].mse_mw2 * len(s.rows) for s in chosen)
@@ -309,7 +309,7 @@ class Judgement:
         return _weighted([(len(s.rows), s.scores[name].samples.mean) for s in self.kinds(kind)])
 
     def gain(self, name: str, other: str, kind: SegmentKind | None = None) -> PairedTest:
-        """Test the squared error of ``other`` less that of ``name``; positive speaks for ``name``.
+        """Test the squared error of ``other`` minus that of ``name``; positive favours ``name``.
 
         Segments in which one of them is not finite are left out.
         """
@@ -324,7 +324,7 @@ class Judgement:
         return sum(not np.isfinite(s.scores[name].mse_mw2) for s in self.kinds(kind))
 
     def passed(self, name: str, *, as_paper: bool) -> tuple[int, int]:
-        """Return in how many segments zero mean difference stands, and how many were tested."""
+        """Return the number of segments in which zero is not rejected, and the number tested."""
         tests = [
             s.scores[name].samples if as_paper else s.scores[name].effective for s in self.segments
         ]
@@ -333,7 +333,7 @@ class Judgement:
 
 
 def _weighted(pairs: list[tuple[int, float]]) -> PairedTest:
-    """Test values of segments so that their mean is the mean over samples."""
+    """Test values of segments, weighted such that their mean is the mean over samples."""
     if not pairs:
         return over_blocks(np.empty(0))
     weight = np.array([n for n, _ in pairs], dtype=np.float64)
@@ -341,7 +341,7 @@ def _weighted(pairs: list[tuple[int, float]]) -> PairedTest:
 
 
 def judge(trial: Trial, predictions: Mapping[str, FloatArray]) -> Judgement:
-    """Judge predictions on the special segments of other data.
+    """Test predictions on the special segments of other data.
 
     Parameters
     ----------
@@ -352,7 +352,7 @@ def judge(trial: Trial, predictions: Mapping[str, FloatArray]) -> Judgement:
     Raises
     ------
     DataError
-        No special segment has enough rows that can be judged.
+        No special segment has enough usable rows.
     """
     kept = [(a, b, kind, a + np.flatnonzero(trial.good[a:b])) for a, b, kind in trial.spans]
     inside = sum(len(rows) for *_, rows in kept)
@@ -387,7 +387,7 @@ def _nothing_judged(trial: Trial) -> str:
 
 
 def _widening(trial: Trial, predictions: Mapping[str, FloatArray], spans: IntArray) -> float:
-    """Take the correlation in time from the prediction that leaves the least."""
+    """Return the widening of the prediction with the smallest mean squared error."""
     rows = np.concatenate([np.arange(a, b) for a, b in spans.tolist()])
     rows = rows[trial.good[rows]]
     best, least = None, np.inf
@@ -414,7 +414,7 @@ def samples_of(contents: WindowContents, settings: Settings) -> Samples:
     """Return the rows of a window.
 
     A row without opening, pressure or power is not usable; a jump in time is a
-    gap even where no row stands in it.
+    gap even without rows in it.
     """
     usable = (np.isfinite(contents.u) & np.isfinite(contents.power_mw)).astype(np.uint8)
     step_s = settings.real('sample_period')
@@ -430,7 +430,7 @@ def samples_of(contents: WindowContents, settings: Settings) -> Samples:
 
 
 def other_data(contents: WindowContents, settings: Settings) -> OtherData:
-    """Return the rows of a window with its special segments, to judge by."""
+    """Return the rows of a window with its special segments, for a test."""
     opening = contents.opening_percent
     return OtherData(
         samples_of(contents, settings), contents.time_ns, contents.spans,
@@ -439,10 +439,10 @@ def other_data(contents: WindowContents, settings: Settings) -> OtherData:
 
 
 class Runnable(Protocol):
-    """A model that can be run over measured inputs."""
+    """A model that can be simulated with measured inputs."""
 
     def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
-        """Return the simulated power in MW and where it has settled."""
+        """Return the simulated power in MW and a mask of settled rows."""
 
 
 def part_of(samples: Samples, start: int, end: int) -> Samples:
@@ -454,13 +454,13 @@ def part_of(samples: Samples, start: int, end: int) -> Samples:
 
 
 def cut_samples(samples: Samples) -> tuple[Samples, Samples]:
-    """Return the part to learn from and the later part to choose by.
+    """Return the part for fitting and the later part for model selection.
 
     Raises
     ------
     TooFewSamplesError
-        Too few usable rows, or too few that lie far enough behind a gap: altogether, or in one
-        of the two parts.
+        Too few usable rows, or too few that are far enough after a gap: in total, or in one of
+        the two parts.
     """
     usable = int(samples.usable.sum())
     least = least_rows(samples.step_s)
@@ -475,7 +475,7 @@ def cut_samples(samples: Samples) -> tuple[Samples, Samples]:
 
 
 def _settled_enough(samples: Samples, least: int) -> None:
-    # As coarse as searches take them: a mean counts only if all its rows do.
+    # Averaged as in the searches: a mean is used only if all its rows are usable.
     coarse = samples.coarser()
     factor = round(coarse.step_s / samples.step_s)
     settled = settled_rows(coarse)[: coarse.means * coarse.group]
@@ -488,14 +488,14 @@ def _settled_enough(samples: Samples, least: int) -> None:
 
 
 def settled_rows(samples: Samples) -> BoolArray:
-    """Return where a row is usable and lies farther behind a gap than the transient lasts."""
+    """Return a mask of usable rows with a longer distance from a gap than the transient."""
     place = np.arange(1, len(samples.u) + 1)
     last = np.maximum.accumulate(np.where(samples.usable > 0, 0, place))
     return np.asarray(place - last > round(samples.settle_s / samples.step_s))
 
 
 def run_mse(model: Runnable, samples: Samples) -> float:
-    """Return the mean squared error in MW^2 of a free run; infinite where it runs away."""
+    """Return the mean squared error in MW^2 of a free simulation; infinite if it diverges."""
     answer, settled = model.run(samples)
     keep = settled > 0
     if not keep.any():
@@ -507,17 +507,17 @@ def run_mse(model: Runnable, samples: Samples) -> float:
 
 
 def dynamic(characteristic: Characteristic, samples: Samples) -> FloatArray:
-    """Return the power that curve and regional dynamics simulate, MW, shape (n,)."""
+    """Return the power simulated with curve and regional dynamics, MW, shape (n,)."""
     s, model = samples, characteristic.model
     scale = 1.0 if s.scale is None else s.scale
     return model.respond(s.u, s.usable, s.step_s, s.settle_s, scale)[0]
 
 
 def trial_of(other: OtherData, characteristic: Characteristic) -> Trial:
-    """Return the measured data with the rows that can be judged.
+    """Return the measured data with the rows that can be used for the test.
 
-    These are the same for every method: inside the range of u the proposed curve is known
-    for, and as far behind a gap as the slowest dynamics allowed for.
+    These are the same for every method: inside the u range of the proposed curve, and far
+    enough after a gap for the slowest allowed dynamics.
     """
     samples = other.samples
     low, high = characteristic.model.knots[[0, -1]]

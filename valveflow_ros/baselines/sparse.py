@@ -1,13 +1,13 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse identification of nonlinear dynamics (SINDy), tuned on data of its own.
+"""Sparse identification of nonlinear dynamics (SINDy), tuned on held-out data.
 
 The model is ``y' = xi . theta(y, u)`` with theta = [1, y, u, y^2, y u, u^2, y^3, y^2 u, y u^2,
 u^3, sin y, sin u, cos y, cos u]: the 14 entries of the paper's vector Xi (Section IV), of which
 the first belongs to the constant. The solver is sequentially thresholded least squares. Columns
-are scaled to unit size first: u^3 is 1e10 and cos u is 1, and one threshold must mean the same
-for both. How derivatives are taken and the threshold are chosen by how well the last part of the
-identification data is simulated from the first.
+are first scaled to unit size so that one threshold suits all: u^3 is 1e10 and cos u is 1. The
+method for derivatives and the threshold are chosen by the simulation error on the last part of
+the identification data after a fit to the first part.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ NAMES = (
     'sin y', 'sin u', 'cos y', 'cos u',
 )  # fmt: skip
 SIZE = len(NAMES)
-_LONGEST_STEP_S = 5.0  # of an integration
-_AWAY = 1e6  # MW; what has gone further does not come back
+_LONGEST_STEP_S = 5.0  # maximum step of the integration
+_AWAY = 1e6  # MW; a larger solution has diverged
 
 
 @jit
@@ -100,10 +100,10 @@ def simulate(
     u: FloatArray, usable: ByteArray, begin: FloatArray, xi: FloatArray, step_s: float,
     settle: int, answer: FloatArray, settled: ByteArray,
 ) -> None:  # fmt: skip
-    """Integrate, u straight between rows.
+    """Integrate with u linear between rows.
 
-    ``begin`` (n,) is the power to begin with after a gap. ``answer`` is NaN in
-    gaps and infinite once the solution has run away.
+    ``begin`` (n,) is the initial power after a gap. ``answer`` is NaN in gaps and
+    infinite after the solution has diverged.
     """
     y = 0.0
     age = 0
@@ -127,10 +127,10 @@ def weak_rows(
     y: FloatArray, theta_rows: FloatArray, usable: ByteArray, centres: IntArray,
     test: FloatArray, slope: FloatArray, out: FloatArray,
 ) -> int:  # fmt: skip
-    """Write rows ``[integral of phi theta, - integral of phi' y]``; return how many.
+    """Write rows ``[integral of phi theta, - integral of phi' y]``; return their number.
 
-    ``test`` and ``slope`` are phi and phi' on rows -w..w. A window with a gap in
-    it is left out.
+    ``test`` and ``slope`` are phi and phi' on rows -w..w. A window with a gap is
+    left out.
     """
     half = test.size // 2
     written = 0
@@ -152,11 +152,11 @@ def weak_rows(
     return written
 
 
-_START_S = 30.0  # power averaged to begin with after a gap
-_PLACES = 400  # inputs at which the rest is searched, at least
-_FINE_U = 0.25  # farthest apart where the rest swings with sin u or cos u: 25 to a period
+_START_S = 30.0  # averaging time of the initial power after a gap
+_PLACES = 400  # minimum number of inputs at which the steady state is searched
+_FINE_U = 0.25  # maximum step of u if sin u or cos u is present: 25 per period
 _SWINGING = tuple(NAMES.index(name) for name in ('sin u', 'cos u'))
-_GRID = 1500  # places at which a change of sign is looked for
+_GRID = 1500  # number of points for the search of a change of sign
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +166,11 @@ class SparseModel:
     Attributes
     ----------
     xi : float64 (14,)
-        MW/s per unit of each function; 0 is absent.
+        MW/s per unit of each function; 0 if the function is absent.
     u_from, u_to, power_from, power_to : float
-        What the data it was made from covered.
+        The range of the data used for the fit.
     power_mean : float
-        Their mean power.
+        The mean power of these data.
     step_s : float
     """
 
@@ -184,13 +184,13 @@ class SparseModel:
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Return the names of the functions that are there."""
+        """Return the names of the functions in the model."""
         return tuple(n for n, x in zip(NAMES, self.xi, strict=True) if x != 0.0)
 
     def run(self, samples: Samples) -> tuple[FloatArray, ByteArray]:
-        """Return the simulated power in MW and where it has settled, shapes (n,).
+        """Return the simulated power in MW and a mask of settled rows, shapes (n,).
 
-        After a gap it begins at the measured power of the first half minute.
+        After a gap it begins with the measured power of the first half minute.
         """
         rows = max(1, round(_START_S / samples.step_s))
         begin = np.full(len(samples.u), self.power_mean)
@@ -207,12 +207,12 @@ class SparseModel:
         return answer, settled
 
     def static(self, u: FloatArray) -> FloatArray:
-        """Return the power at which the model rests; NaN where it rests nowhere.
+        """Return the steady-state power of the model; NaN if there is none.
 
-        A rest is a power where y' falls through zero. Where there are several, the
-        curve goes on to the nearest from the middle of the data outwards. It is
-        searched at evenly spaced inputs and straight between them, so ``u`` should hold no
-        rows of gaps: they stretch the range that is searched.
+        A stable steady state is a power at which y' falls through zero. If there are several,
+        the curve continues with the nearest one, from the middle of the data outwards. It is
+        searched at equally spaced inputs and interpolated linearly. ``u`` should contain no
+        rows of gaps, because they would enlarge the searched range.
         """
         u = np.asarray(u, dtype=np.float64)
         low, high = min(self.u_from, float(u.min())), max(self.u_to, float(u.max()))
@@ -235,7 +235,7 @@ class SparseModel:
 
 
 def _rest(xi: FloatArray, u: float, y: FloatArray, near: float) -> float:
-    """Return the stable rest nearest to ``near``, NaN if there is none."""
+    """Return the stable steady state nearest to ``near``, NaN if there is none."""
     values = columns(y, np.full(len(y), u)) @ xi
     falls = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
     if not len(falls):
@@ -250,13 +250,13 @@ def _rest(xi: FloatArray, u: float, y: FloatArray, near: float) -> float:
 # smooth test function that vanishes at the ends of a window and integrated, which moves the
 # derivative from the data to the test function.
 
-_ORDER = 2  # of the local polynomials
-_STEEP = 4  # phi = (1 - s^2)^4: smooth enough that its derivative vanishes at the ends too
+_ORDER = 2  # degree of the local polynomials
+_STEEP = 4  # phi = (1 - s^2)^4, whose derivative is also zero at the ends
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How the equations are made.
+    """The method for the derivatives in the equations.
 
     Attributes
     ----------
@@ -271,12 +271,12 @@ class Form:
 
 
 _WINDOWS_S = (5.0, 11.0, 21.0, 61.0)
-_WINDOWS_ROWS = (5, 7, 11, 21)  # where rows are too far apart for such windows
+_WINDOWS_ROWS = (5, 7, 11, 21)  # if the step of the rows is too large for these windows
 _FAR_S = 5.0
 
 
 def forms_for(step_s: float) -> tuple[Form, ...]:
-    """Return what to try for rows ``step_s`` apart."""
+    """Return the forms to try for rows with the step ``step_s``."""
     windows = [rows * step_s for rows in _WINDOWS_ROWS] if step_s > _FAR_S else _WINDOWS_S
     return tuple(Form(kind, w) for kind in ('derivative', 'weak') for w in windows)
 
@@ -284,7 +284,7 @@ def forms_for(step_s: float) -> tuple[Form, ...]:
 def equations(samples: Samples, form: Form) -> FloatArray:
     """Return rows ``[theta | y']``, shape (k, 15); both sides may be integrals.
 
-    Windows overlap by half; what is nearer says little new.
+    Windows overlap by half; a larger overlap adds little information.
     """
     half = max(2, round(0.5 * form.window_s / samples.step_s))
     make = _weak if form.kind == 'weak' else _derivative
@@ -324,7 +324,7 @@ def _weak(samples: Samples, half: int, centres: IntArray) -> FloatArray:
 
 
 THRESHOLDS = (0.0, *np.geomspace(1e-3, 1e3, 31).tolist())
-_SPARE = 1.01  # a sparser model may be this much worse than the best
+_SPARE = 1.01  # allowed relative loss of a sparser model
 _ROUNDS = 30
 
 Progress = Callable[[str], None]
@@ -332,17 +332,17 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class SparseFit:
-    """The model and how it was chosen.
+    """The model and the evidence for its choice.
 
     Attributes
     ----------
     model : SparseModel
     form : Form
-        How the equations were made.
+        The method for the derivatives.
     threshold : float
-        On coefficients of scaled columns.
+        Threshold of the coefficients of scaled columns.
     mse_by_form : tuple of (kind, window in s, functions, mean squared error in MW^2)
-        The best of each form on the part held out.
+        The best result of each form on the held-out part.
     """
 
     model: SparseModel
@@ -360,14 +360,14 @@ class _Candidate:
 
 
 def thresholded(theta: FloatArray, target: FloatArray, threshold: float) -> FloatArray:
-    """Sequentially thresholded least squares.
+    """Solve by sequentially thresholded least squares.
 
     Parameters
     ----------
     theta : float64 (k, P)
     target : float64 (k,)
     threshold : float
-        Smaller coefficients are set to zero and the rest is fitted again, until nothing changes.
+        Smaller coefficients are set to zero and the others are refitted until nothing changes.
 
     Returns
     -------
@@ -387,10 +387,10 @@ def thresholded(theta: FloatArray, target: FloatArray, threshold: float) -> Floa
 
 
 def _triangle(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scale columns to unit size and fold all rows into a triangle.
+    """Scale columns to unit size and reduce all rows to a triangular matrix.
 
-    Least squares in any subset of columns is the same in the triangle (15, 15) as in all rows;
-    returned with it are the scales (15,).
+    Least squares in any subset of columns gives the same result with the triangle (15, 15) as
+    with all rows. The scales (15,) are returned, too.
     """
     scale = np.sqrt(np.mean(rows**2, axis=0))
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -404,9 +404,9 @@ def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseF
     Raises
     ------
     TooFewSamplesError
-        Too few usable rows, or too few that lie far enough behind a gap.
+        Too few usable rows, or too few that are far enough after a gap.
     DataError
-        No model of the library can be run over the data without running away.
+        The simulation of every model of the library diverges on the data.
     """
     learn, judge = cut_samples(samples)
     judge = judge.coarser()

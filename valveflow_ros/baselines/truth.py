@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is true of a simulated plant, and how far a curve is from it (Table IV of the paper)."""
+"""The true curve of a simulated plant, and the error of a curve (Table IV of the paper)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PLACES = 2000
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A piecewise-linear curve as numbers.
+    """A piecewise-linear curve.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Line:
     intercepts: FloatArray
 
     def __call__(self, u: FloatArray) -> FloatArray:
-        """Evaluate F; the outer pieces go on."""
+        """Evaluate F; the outer pieces are extended."""
         k = np.searchsorted(self.knots[1:-1], u, side='right')
         return np.asarray(self.slopes[k] * u + self.intercepts[k])
 
@@ -47,13 +47,13 @@ class Truth(Line):
 
 @dataclass(frozen=True, slots=True)
 class CurveError:
-    """How far a curve is from the true one, between two inputs.
+    """The error of a curve relative to the true one, between two inputs.
 
     Attributes
     ----------
     rmse_mw, largest_mw : float
     known : float
-        Share of the range in which the curve says anything; errors are of that share.
+        Fraction of the range in which the curve is defined; the errors refer to it.
     slope, knee, intercept : float
         Largest errors of the parameters, NaN unless the number of pieces is right.
     """
@@ -74,12 +74,12 @@ _SCHEMA = {
 
 
 def read_truth(raw: object) -> Truth:
-    """Read a truth: what ``valveflow simulate --truth`` writes, or a characteristic.
+    """Read a truth written by ``valveflow simulate --truth``, or a characteristic.
 
     Raises
     ------
     DataError
-        It is neither; the sentence names the place.
+        It is neither; the message names the place.
     """
     if not isinstance(raw, dict) or not isinstance(raw.get('pieces'), list) or not raw['pieces']:
         raise DataError("This is no truth of a plant: it must hold a list 'pieces'.")
@@ -93,9 +93,9 @@ def read_truth(raw: object) -> Truth:
 def curve_error(
     curve: Callable[[FloatArray], FloatArray], truth: Truth, u_from: float, u_to: float
 ) -> CurveError:
-    """Return how far ``curve`` is from the truth at evenly spaced inputs.
+    """Return the error of ``curve`` relative to the truth at equally spaced inputs.
 
-    A `Line` with as many pieces as the truth is compared piece by piece too.
+    A `Line` with as many pieces as the truth is also compared piece by piece.
     """
     u = np.linspace(u_from, u_to, _PLACES)
     found = curve(u)

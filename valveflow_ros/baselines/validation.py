@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Does a characteristic hold on other data? Judged on their special segments."""
+"""Validation of a characteristic on the special segments of other data."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ VERSION = 1
 
 
 class Verdict(enum.Enum):
-    """What the data say of the curve."""
+    """The result of a validation."""
 
     HOLDS = 'holds'
     OFF = 'off'
@@ -54,7 +54,7 @@ class PieceCheck:
     test : PairedTest
         Over segments, allowing for correlation between them.
     low_mw, high_mw : float
-        In which the mean lies with 95 % confidence, all pieces together; NaN if not known.
+        Interval of the mean at 95 % confidence for all pieces together; NaN if unknown.
     """
 
     u_from: float
@@ -66,38 +66,38 @@ class PieceCheck:
     high_mw: float
 
     def within(self, tolerance_mw: float) -> bool:
-        """Return True if the mean surely lies within the tolerance."""
+        """Return True if the interval of the mean is within the tolerance."""
         return -tolerance_mw <= self.low_mw and self.high_mw <= tolerance_mw
 
     def beyond(self, tolerance_mw: float) -> bool:
-        """Return True if the mean surely lies beyond the tolerance."""
+        """Return True if the interval of the mean is outside the tolerance."""
         return self.low_mw > tolerance_mw or self.high_mw < -tolerance_mw
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """What came out.
+    """The data and results of a validation.
 
     Attributes
     ----------
     characteristic : Characteristic
     against : Characteristic or None
     judged_by : str
-        The prediction the verdict stands on: the simulation where the dynamics are known,
+        The prediction used for the verdict: the simulation if the dynamics are known,
         else the curve.
     tolerance_mw : float
     trial : Trial
     predictions : mapping of float64 (n,)
     judgement : Judgement
     outside_share : float
-        Share of the special samples whose u the curve is not known for.
+        Fraction of the special samples with u outside the range of the curve.
     overall : PieceCheck
     pieces : tuple of PieceCheck
     verdict : Verdict
     misfit : Misfit or None
-        What the curve gets wrong again and again at the same openings and pressures.
+        The error of the curve that repeats at the same openings and pressures.
     gain : PairedTest or None
-        Squared error of ``against`` less that of this one, MW^2.
+        Squared error of ``against`` minus that of this curve, MW^2.
     """
 
     characteristic: Characteristic
@@ -116,7 +116,7 @@ class Validation:
 
     @property
     def misfit_beyond(self) -> Misfit | None:
-        """Return the misfit where it is beyond the tolerance."""
+        """Return the misfit if it exceeds the tolerance."""
         return self.misfit if self.misfit and self.misfit.rms_mw > self.tolerance_mw else None
 
 
@@ -126,21 +126,21 @@ def validate(
     tolerance_mw: float,
     against: Characteristic | None = None,
 ) -> Validation:
-    """Hold a characteristic against data it has not seen.
+    """Compare a characteristic with data that were not used to fit it.
 
     Parameters
     ----------
     characteristic : Characteristic
     other : OtherData
     tolerance_mw : float
-        A mean difference that does not matter.
+        A mean difference below this is ignored.
     against : Characteristic, optional
-        Another curve, to see which is better.
+        Another curve; the result says which is better.
 
     Raises
     ------
     DataError
-        No special segment can be judged, or the two curves are over different inputs.
+        No special segment can be used, or the two curves have different inputs.
     """
     data = other.on_axis(characteristic.static_form)
     trial = trial_of(data, characteristic)
@@ -168,7 +168,7 @@ def validate(
 
 
 def _misfit(other: OtherData, trial: Trial, predicted: FloatArray) -> Misfit | None:
-    """Return what the static curve gets wrong; nothing where the openings are not known."""
+    """Return the repeated error of the static curve; None if the openings are unknown."""
     opening = other.opening_percent
     if opening is None:
         return None
@@ -190,7 +190,7 @@ def _predictions(
 
 
 def _outside(trial: Trial, characteristic: Characteristic) -> float:
-    """Return the share of special samples beyond the ends of the curve."""
+    """Return the fraction of special samples beyond the ends of the curve."""
     if not len(trial.spans):
         return 0.0
     u = np.concatenate([trial.u[a:b] for a, b, _ in trial.spans])
@@ -201,7 +201,7 @@ def _outside(trial: Trial, characteristic: Characteristic) -> float:
 def _checks(
     characteristic: Characteristic, trial: Trial, judgement: Judgement, by: str
 ) -> tuple[PieceCheck, ...]:
-    """Return the check over everything, then one for each piece."""
+    """Return the check over all data, and one for each piece."""
     knots = characteristic.breakpoints
     last = len(knots) - 1
     middle = [float(trial.u[s.rows].mean()) for s in judgement.segments]
@@ -213,7 +213,7 @@ def _checks(
             s for s, p in zip(judgement.segments, piece, strict=True) if whole or p == first
         )
         test = replace(judgement, segments=mine).bias(by)
-        # All pieces together hold the level.
+        # The confidence level is that of all pieces together.
         low, high = test.interval(_LEVEL if whole else _LEVEL / last)
         samples = sum(len(s.rows) for s in mine)
         found.append(PieceCheck(
@@ -223,10 +223,10 @@ def _checks(
 
 
 def _verdict(checks: tuple[PieceCheck, ...], tolerance_mw: float) -> Verdict:
-    """Off where a mean is surely beyond the tolerance, holding where all are surely within it.
+    """Return the verdict: off if a mean is outside the tolerance, holds if all are within it.
 
-    A piece without segments says nothing, and does not hinder; one with a single segment, or
-    whose interval reaches beyond the tolerance, leaves it open.
+    A piece without segments is ignored. A piece with a single segment, or with an interval
+    that crosses the tolerance, leaves the verdict open.
     """
     seen = [c for c in checks if c.segments]
     if any(c.beyond(tolerance_mw) for c in seen):
@@ -235,7 +235,7 @@ def _verdict(checks: tuple[PieceCheck, ...], tolerance_mw: float) -> Verdict:
 
 
 def to_json(v: Validation) -> dict[str, Any]:
-    """Return the content of ``validation.json``, without the words."""
+    """Return the content of ``validation.json``, without the texts."""
     overall, *pieces = (
         {
             'u_from': c.u_from,

@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The flow characteristic: evaluated, written, inverted, and compared with a reference."""
+"""The flow characteristic: evaluation, JSON, inversion, and comparison with a reference."""

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The result: the flow characteristic, how sure it is, and what it was made from."""
+"""The result: the flow characteristic, its uncertainty, and its data."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from valveflow_ros.signals.units import in_unit
 
 _COMMON_MPA = 10.0
 
-# What a chart was designed for; apart from its kernels, for whoever only reads models.
+# The design of a chart is separate from the chart's kernels: readers of models need no kernels.
 
 
 @dataclass(frozen=True, slots=True)
 class ChartDesign:
-    """What a chart needs to know of the residual it watches.
+    """The design of a control chart for the residual.
 
     Attributes
     ----------
     block_s : float
         Length of a block.
     correlation : float
-        From block to block, 0 <= correlation < 1.
+        Lag-one correlation of block means, 0 <= correlation < 1.
     innovation_mw : float
-        sd of a block mean given the one before.
+        sd of a block mean given the previous one.
     slack : tuple of float
-        What each sum lets pass per block, in innovations: for small and for large shifts.
+        Slack of each sum per block, in innovations: for small and for large shifts.
     limit : tuple of float
-        Where each sum raises the alarm, in innovations.
+        Alarm limit of each sum, in innovations.
     run_length_days : float
-        Mean time between false alarms that the limits were set for.
+        Mean time between false alarms for which the limits were chosen.
     """
 
     block_s: float
@@ -82,9 +82,9 @@ class RegionDynamics:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """How J was chosen: the rule, Omega(J) of eq. (19) and Lambda(J) of eq. (24).
+    """The choice of J: the rule, Omega(J) of eq. (19) and Lambda(J) of eq. (24).
 
-    ``confidence`` is the probability of each J; empty where the rule has none.
+    ``confidence`` is the probability of each J; empty if the rule gives none.
     """
 
     rule: str
@@ -96,9 +96,9 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """What a piece rests on: special segments and samples inside it.
+    """The data of a piece: numbers of special segments and samples inside it.
 
-    ``levels`` are the distinct steady levels in u. ``identifiable`` says whether the
+    ``levels`` are the distinct steady levels in u. ``identifiable`` is True if the
     condition after Proposition 2 of the paper holds.
     """
 
@@ -111,7 +111,7 @@ class Support:
 
 @dataclass(frozen=True, slots=True)
 class FittedData:
-    """The data the curve was fitted to."""
+    """The data to which the curve was fitted."""
 
     window_start_ns: int
     window_end_ns: int
@@ -129,7 +129,7 @@ class FittedData:
     ) -> FittedData:  # fmt: skip
         """Describe a window by its times, its segments, and the temperature in the rows used.
 
-        The paper's condition is an unchanged temperature; its spread is that of 95 % of the rows.
+        The paper requires a constant temperature; its spread is the range of 95 % of the rows.
         """
         known = temperature_degc[np.isfinite(temperature_degc)]
         mean = spread = math.nan
@@ -144,26 +144,26 @@ class FittedData:
 
 @dataclass(frozen=True, slots=True)
 class FormEvidence:
-    """How the form of the curve compares with the other one, on stretches of time held out.
+    """Comparison of the form of the curve with the other form, on held-out stretches of time.
 
     Attributes
     ----------
     chosen : str
         'integrated_input' or 'opening'.
     told : bool
-        The data tell the two apart in favour of the one chosen.
+        True if the data decide for the chosen form.
     log_likelihood_gain : float
-        Of the one chosen.
+        Gain of the chosen form.
     rmse_mw, rmse_other_mw : float
         Errors of means over a minute.
     other : str
-        The other form with the exponent that suits it best.
+        The other form with its best exponent.
     apart_mw : float
-        Root mean square of the difference between the two over what was visited.
+        Root mean square difference of the two forms over the visited range.
     worst : tuple of float
         Opening in %, pressure in MPa and difference in MW where 1 % of the means differ more.
     contradicted : bool
-        The form was given, and the data tell that it is the wrong one.
+        True if the form was given, and the data show that it is wrong.
     """
 
     chosen: str
@@ -179,9 +179,9 @@ class FormEvidence:
 
 @dataclass(frozen=True, slots=True)
 class HeldCause:
-    """A cause of the diagnosis that was taken out of the rows before the curve was fitted.
+    """A cause of the diagnosis that was removed from the rows before the curve was fitted.
 
-    ``values`` are its parameters by name; ``sentence`` says it to a person.
+    ``values`` are its parameters by name; ``sentence`` is the text for the user.
     """
 
     name: str
@@ -191,11 +191,11 @@ class HeldCause:
 
 @dataclass(frozen=True, slots=True)
 class ResidualStatistics:
-    """What residuals of this curve look like on the data it was fitted to (MW).
+    """Statistics of the residuals of this curve on the data to which it was fitted (MW).
 
-    95 % of single measurements lie within +- ``width_mw`` of the prediction. ``chart`` watches
-    for a lasting shift; without one there is no alarm. ``wander_mw`` is the sd with which the
-    level moves from day to day while nothing is wrong (weather), NaN where that is not known.
+    95 % of single measurements lie within +- ``width_mw`` of the prediction. ``chart`` detects
+    a lasting shift; without it there is no alarm. ``wander_mw`` is the sd of the level from
+    day to day of a healthy unit (weather), NaN if unknown.
     """
 
     rmse_mw: float
@@ -208,19 +208,19 @@ class ResidualStatistics:
     wander_mw: float = math.nan
 
 
-# Days of weather are alike for about so long.
+# Correlation time of the weather.
 _WANDER_NS = 2 * 86_400 * NS_PER_S
 
 
 def level_error_mw(wander_mw: float, start_ns: int, end_ns: int) -> float:
-    """Return the standard error of a mean over some days, as one of many days.
+    """Return the standard error of a mean over a period, due to the variation over days.
 
     Parameters
     ----------
     wander_mw : float
-        sd from day to day; the error is 0 where it is NaN, not known.
+        sd from day to day; the error is 0 if it is NaN (unknown).
     start_ns, end_ns : int
-        Of those days.
+        Start and end of the period.
     """
     share = _WANDER_NS / (_WANDER_NS + max(end_ns - start_ns, 0))
     return 0.0 if math.isnan(wander_mw) else wander_mw * math.sqrt(share)
@@ -230,22 +230,22 @@ def level_error_mw(wander_mw: float, start_ns: int, end_ns: int) -> float:
 class Characteristic:
     """A fitted flow characteristic: static power is p^e F(u) + c.
 
-    Where causes were ``held`` the curve is that of the plant without them.
+    If causes are ``held``, the curve is that of the plant without them.
 
     Attributes
     ----------
     pressure_exponent : float
-        q of u = V p^q: m of the paper's form, 0 where the knees stand at fixed openings.
+        q of u = V p^q: m of the paper's form, 0 if the breakpoints are at fixed openings.
     axis : str
         'integrated_input' (the paper's: e = 0, c = 0) or 'opening' (q = 0).
     pressure_scale_exponent, offset_mw : float
         e and c.
     reference_pressure_mpa : float
-        Median pressure of the data, NaN where it is not known; see `shown_at_mpa`.
+        Median pressure of the data, NaN if unknown; see `shown_at_mpa`.
     form : FormEvidence or None
-        How this form compares with the other; None where they were not compared.
+        Comparison of this form with the other one; None if they were not compared.
     output_unit : str
-        MW, or the unit of a flow: everything that is named ``_mw`` or told in MW is in it.
+        MW, or the unit of a flow: all values named ``_mw`` or described as MW have this unit.
     """
 
     pressure_exponent: float
@@ -277,16 +277,16 @@ class Characteristic:
 
     @property
     def shown_at_mpa(self) -> float:
-        """Return the pressure that a curve with e > 0 is shown at.
+        """Return the pressure at which a curve with e > 0 is shown.
 
-        That of reference; a common one where a file of another program does not state it.
+        It is the reference pressure, or a usual one if a file of another program has none.
         """
         p = self.reference_pressure_mpa
         return _COMMON_MPA if self.axis == OPENING and math.isnan(p) else p
 
     @property
     def reference_scale(self) -> float:
-        """Return p^e at the pressure the curve is shown at; 1 for the paper's form."""
+        """Return p^e at the pressure at which the curve is shown; 1 for the paper's form."""
         return float(self.static_form.scale(self.shown_at_mpa))
 
     @property
@@ -296,7 +296,7 @@ class Characteristic:
 
     @property
     def model(self) -> RegionalModel:
-        """Return the numbers as the model that predicts."""
+        """Return the curve and the dynamics as a model for prediction."""
         slopes = np.array([p.slope for p in self.pieces])
         intercepts = np.array([p.intercept for p in self.pieces])
         knots = self.breakpoints
@@ -313,16 +313,16 @@ class Characteristic:
     def values(self) -> FloatArray:
         """Return the power at the breakpoints in MW, (J + 1,); at a jump the mean of both ends.
 
-        At the reference pressure where the form has p^e.
+        The pressure is the reference pressure if the form has p^e.
         """
         m = self.at_pressure().model
         inner = 0.5 * (m.right[:-1] + m.left[1:])
         return np.concatenate([m.left[:1], inner, m.right[-1:]])
 
     def at_pressure(self, pressure_mpa: float | None = None) -> Characteristic:
-        """Return the curve at one pressure, that of reference unless given: power is F(u) alone.
+        """Return the curve at one pressure, by default the reference pressure: power is F(u).
 
-        What is told in MW is in MW then. The paper's form is such a curve at every pressure.
+        All its values in MW are then in MW. The paper's form is returned unchanged.
         """
         if self.axis != OPENING:
             return self
@@ -348,8 +348,8 @@ class Characteristic:
     ) -> FloatArray:
         """Return the static power in MW, eq. (26); NaN outside the identified range.
 
-        Nothing is known beyond the outer breakpoints, so nothing is said there. The pressure
-        is that of reference unless given; in the paper's form u contains it.
+        The curve is unknown beyond the outer breakpoints. The default pressure is the
+        reference pressure; in the paper's form u contains the pressure.
         """
         u = np.asarray(u, dtype=np.float64)
         knots = self.breakpoints
@@ -358,7 +358,7 @@ class Characteristic:
         return np.where(inside, self.model.static(u, self.static_form.scale(p)), np.nan)
 
     def inverse(self, power_mw: FloatArray) -> FloatArray:
-        """Return u at which the power is x, at the reference pressure; NaN where it is none.
+        """Return u at which the power is x, at the reference pressure; NaN if there is none.
 
         Raises
         ------
@@ -374,7 +374,7 @@ class Characteristic:
             )
         x, u = _rising_points(m)
         power = np.asarray(power_mw, dtype=np.float64)
-        # Of equal x the first counts: the smallest u that reaches the power.
+        # If x repeats, use the first one: the smallest u that reaches the power.
         i = np.clip(np.searchsorted(x, power, side='left'), 1, len(x) - 1)
         with np.errstate(invalid='ignore'):
             share = (power - x[i - 1]) / (x[i] - x[i - 1])
@@ -394,8 +394,8 @@ class Characteristic:
         Returns
         -------
         float64
-            p^e F(V p^q) + c. NaN outside the identified range of u = V p^q, where the pressure
-            is not positive, and where an argument is NaN.
+            p^e F(V p^q) + c. NaN outside the identified range of u = V p^q, if the pressure
+            is not positive, and if an argument is NaN.
         """
         opening, pressure = np.broadcast_arrays(
             np.asarray(opening_percent, dtype=np.float64),
@@ -417,13 +417,13 @@ class Characteristic:
         Returns
         -------
         float64
-            The only opening from 0 to 100 % at which `power` is ``power_mw``, but for rounding.
-            NaN where there is none: beyond the ends of the curve, within a jump, above full
-            opening. NaN where there are several: on a flat piece, and where the curve falls.
+            The unique opening from 0 to 100 % at which `power` is ``power_mw``, up to rounding.
+            NaN if there is none: beyond the ends of the curve, within a jump, above full
+            opening. NaN if there are several: on a flat piece, and if the curve falls.
 
         See Also
         --------
-        inverse : the same in u, for curves that rise throughout; it answers within a jump.
+        inverse : the same in u, for curves that always rise; also defined within a jump.
         """
         power, pressure = np.broadcast_arrays(
             np.asarray(power_mw, dtype=np.float64), np.asarray(pressure_mpa, dtype=np.float64)
@@ -441,11 +441,11 @@ class Characteristic:
             at = low + (flow - m.left[k]) / slope
             here = (at >= low - rounding) & (at <= high + rounding)
             at = np.clip(at, low, high)
-            # At a knot the pieces on both sides give the same answer, unless there is a jump.
+            # At a knot the pieces on both sides give the same opening, unless there is a jump.
             other = here & ~np.isnan(found) & ~(np.abs(found - at) <= 2.0 * rounding)
             found = np.where(here & np.isnan(found), at, found)
             found[other] = np.inf
-        # What is at the lower end of a jump belongs to the other side of it: F counts.
+        # At a jump only one end belongs to F: check the opening with F.
         with np.errstate(invalid='ignore', divide='ignore'):
             back = self(found, positive)
             reached = np.abs(back - power) <= 1e-9 * np.maximum(1.0, np.abs(power))
@@ -454,7 +454,7 @@ class Characteristic:
         return np.where(known, np.minimum(opening, 100.0), np.nan)
 
     def measured_in(self, unit: str) -> Characteristic:
-        """Return the same numbers as those of an output in ``unit``, and sentences that say so."""
+        """Return the same values for an output in ``unit``, with sentences in that unit."""
         return replace(
             self, output_unit=unit, notes=tuple(in_unit(note, unit) for note in self.notes),
             choice=replace(self.choice, note=in_unit(self.choice.note, unit)),
@@ -462,7 +462,7 @@ class Characteristic:
 
     def with_id(self) -> Characteristic:
         """Return a copy whose `model_id` is a hash of its numbers."""
-        # Held causes count where there are some; the names of other curves stay what they were.
+        # Held causes change the hash only if there are any, so that other curves keep their names.
         told = repr(replace(self, model_id='')) + (repr(self.held) if self.held else '')
         if self.axis == OPENING:
             told += repr((self.axis, self.pressure_scale_exponent, self.offset_mw))
@@ -472,10 +472,10 @@ class Characteristic:
 
 
 def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
-    """Return (x, u) along which the smallest u that reaches a power lies.
+    """Return the points (x, u) of the line of the smallest u that reaches each power.
 
-    At a jump up the knot answers for all powers inside it; after a jump down a
-    piece counts only from where it goes beyond what was reached before.
+    For all powers inside a jump up it is the knot; after a jump down a piece is
+    used only above the powers that were reached before.
     """
     points = [(float(m.left[0]), float(m.knots[0]))]
     for k, slope in enumerate(m.slopes()):
@@ -483,13 +483,13 @@ def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
         low = max(float(m.left[k]), reached)
         if m.right[k] > low:
             begin = float(m.knots[k] + (low - m.left[k]) / slope)
-            # Powers inside a jump, or skipped by lower pieces, are answered by where this begins.
+            # Powers inside a jump, or not reached by lower pieces, are mapped to ``begin``.
             points += [(reached, begin), (low, begin), (float(m.right[k]), float(m.knots[k + 1]))]
     points = [points[0], *(b for a, b in itertools.pairwise(points) if a != b)]
     return np.array([x for x, _ in points]), np.array([u for _, u in points])
 
 
-# How far off a curve may be at one u, told from the two standard errors of its pieces.
+# The standard error of a curve at one u, from the standard errors of slope and intercept.
 
 
 def piece_error(piece: Piece, u: FloatArray) -> FloatArray:
@@ -504,14 +504,14 @@ def piece_error(piece: Piece, u: FloatArray) -> FloatArray:
     Returns
     -------
     float64 (n,)
-        NaN where the slope's error is not known.
+        NaN if the slope's error is unknown.
 
     Notes
     -----
     A line through samples with mean m and variance v of u has the error
-    ``slope_stderr * sqrt((u - m)^2 + v)``. Slope and intercept errors alone do not say
-    where m is (their difference is one of large numbers), so the samples are taken to be
-    spread evenly over the piece: m is its middle and v a twelfth of its width squared.
+    ``slope_stderr * sqrt((u - m)^2 + v)``. m cannot be computed accurately from the errors of
+    slope and intercept (a difference of large numbers), so the samples are assumed to be
+    uniform over the piece: m is its middle and v a twelfth of its width squared.
     """
     u = np.asarray(u, dtype=np.float64)
     width, middle = piece.u_to - piece.u_from, 0.5 * (piece.u_from + piece.u_to)
@@ -519,14 +519,14 @@ def piece_error(piece: Piece, u: FloatArray) -> FloatArray:
 
 
 def piece_of(curve: Characteristic, u: FloatArray) -> IntArray:
-    """Return the index of the piece at each ``u``; beyond the ends the outer pieces."""
+    """Return the index of the piece at each ``u``; beyond the ends that of the outer piece."""
     return np.asarray(np.searchsorted(curve.breakpoints[1:-1], u, side='right'))
 
 
 def curve_error(curve: Characteristic, u: FloatArray) -> FloatArray:
     """Return the standard error of the curve in MW, shape of ``u``; see `piece_error`.
 
-    At the reference pressure where the form has p^e.
+    The pressure is the reference pressure if the form has p^e.
     """
     u = np.asarray(u, dtype=np.float64)
     index = piece_of(curve, u)

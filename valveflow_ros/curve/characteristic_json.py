@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The characteristic as JSON: what ``characteristic.json`` holds, and what is believed of one."""
+"""The characteristic as JSON: the content of ``characteristic.json``, and its validation."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import FLOW_UNITS
 from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, StaticForm
 
-# Causes held while a curve was fitted, as JSON.
+# Causes that were kept fixed while a curve was fitted, as JSON.
 
 
 def held_json(held: tuple[HeldCause, ...]) -> dict[str, Any]:
-    """Return the causes under their key; a curve without any has no such key."""
+    """Return the causes under their key; empty for a curve without causes."""
     if not held:
         return {}
     return {
@@ -52,17 +52,17 @@ def held_json(held: tuple[HeldCause, ...]) -> dict[str, Any]:
     }
 
 
-# The name of a cause, and the values it has there; which they are its catalogue knows.
+# The name of a cause, and its values; the catalogue of causes defines which values it has.
 HELD = Maybe(ListOf({'name': Text(), 'values': Members(Number(-1e12, 1e12)), 'sentence': Text()}))
 
 
 def held_from(raw: object) -> tuple[HeldCause, ...]:
-    """Read what `held_json` wrote from the object that has it, or has none.
+    """Read the causes that `held_json` wrote from an object, which may have none.
 
     Raises
     ------
     DataError
-        It is not that; the sentence names the place.
+        The content is invalid; the message names the place.
     """
     return _held(checked(raw, {'held': HELD}, _WHOLE)['held'])
 
@@ -83,7 +83,7 @@ _LEAST_EXPONENT = 0.5
 
 
 def _number(value: float) -> float | None:
-    """JSON has neither NaN nor infinity: absent is null."""
+    """Replace NaN and infinity, which JSON does not have, by None."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -100,7 +100,7 @@ def _piece_json(piece: Piece) -> dict[str, Any]:
 
 
 def _supported_json(c: Characteristic) -> list[dict[str, Any]]:
-    """Return the pieces, each with what it rests on where that is known."""
+    """Return the pieces, each with its data if these are known."""
     pieces = [_piece_json(p) for p in c.pieces]
     for piece, support in zip(pieces, c.support, strict=False):
         piece['identifiable'] = support.identifiable
@@ -114,7 +114,7 @@ def _supported_json(c: Characteristic) -> list[dict[str, Any]]:
 
 
 def _chart_json(chart: ChartDesign | None) -> dict[str, Any]:
-    """Return the chart under its key; a curve without one has no such key."""
+    """Return the chart under its key; empty for a curve without a chart."""
     if chart is None:
         return {}
     small, large = (
@@ -133,7 +133,7 @@ def _chart_json(chart: ChartDesign | None) -> dict[str, Any]:
 
 
 def _form_json(form: FormEvidence | None) -> dict[str, Any]:
-    """Return the evidence under its key; a curve without any has no such key."""
+    """Return the evidence under its key; empty for a curve without evidence."""
     if form is None:
         return {}
     return {
@@ -204,7 +204,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
             'input_noise': c.residuals.input_noise,
             'power_noise_mw': c.residuals.power_noise_mw,
             'width_mw': _number(c.residuals.width_mw),
-            # A curve that does not know it has no such key, and keeps its name.
+            # No key if the value is unknown, so that the hash of older curves is unchanged.
             **({'wander_mw': wander_mw} if math.isfinite(wander_mw) else {}),
             **_chart_json(c.residuals.chart),
         }
@@ -217,7 +217,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
     }
 
 
-# An error that is hardly known may be beyond all bounds.
+# A very uncertain error may be arbitrarily large.
 _ERROR = Number(0.0, 1e30, null=True)
 PIECE = {
     'u_from': Number(*U), 'u_to': Number(*U), 'slope': Number(-1e9, 1e9),
@@ -255,7 +255,7 @@ _SCHEMA = {
         {**PIECE, 'identifiable': Maybe(Flag()), 'support': Maybe(_SUPPORT)}, 1, MOST_PIECES
     ),
     'breakpoint_intervals': ListOf(
-        # Where a breakpoint is hardly known its interval leaves the plant.
+        # The interval of a very uncertain breakpoint may exceed the range of the plant.
         ListOf(Number(-1e30, 1e30, null=True), 2, 2)
     ),
     'selection': {
@@ -296,13 +296,13 @@ _SCHEMA = {
 def from_json(raw: object) -> Characteristic:
     """Read the content of ``characteristic.json``.
 
-    What DESIGN's contract names must be there; what this program adds to it may
-    be missing, as in a file another program wrote.
+    The keys of the specified format are required; keys that this program adds may
+    be missing, as in a file of another program.
 
     Raises
     ------
     DataError
-        It is not one, or not one this version can read; the sentence names the place.
+        It is invalid, or of an unsupported version; the message names the place.
     """
     if not isinstance(raw, dict) or raw.get('format') != FORMAT:
         raise DataError(f"This is no flow characteristic: 'format' must be '{FORMAT}'.")
@@ -325,7 +325,7 @@ def from_json(raw: object) -> Characteristic:
     temperature = temperature or {'mean_degc': math.nan, 'spread_k': math.nan, 'flag': False}
     pressure = top['reference_pressure_mpa']
     return Characteristic(
-        # Where the knees stand at fixed openings u is V, whatever another program wrote.
+        # With breakpoints at fixed openings u is V, whatever exponent another program wrote.
         pressure_exponent=form.input_exponent,
         pieces=tuple(map(_piece, top['pieces'])),
         breakpoint_intervals=tuple((low, high) for low, high in top['breakpoint_intervals']),
@@ -358,12 +358,12 @@ def from_json(raw: object) -> Characteristic:
 
 
 def form_of(top: dict[str, Any], whole: str, inside: str = '') -> StaticForm:
-    """Return the form that a model's keys name, and refuse what does not belong to the axis.
+    """Return the form that a model's keys specify, and refuse keys that do not suit the axis.
 
     Raises
     ------
     DataError
-        The sentence names the key, which lies ``inside`` another one.
+        The message names the key, which is ``inside`` another one.
     """
     axis = top['axis'] or INTEGRATED_INPUT
     scale, offset = top['pressure_scale_exponent'] or 0.0, top['offset_mw'] or 0.0
@@ -403,7 +403,7 @@ def _piece(found: dict[str, Any]) -> Piece:
 
 
 def _support(pieces: list[dict[str, Any]]) -> tuple[Support, ...]:
-    """Return what the pieces rest on; empty unless every piece says so."""
+    """Return the data of the pieces; empty unless every piece has them."""
     if any(p['support'] is None or p['identifiable'] is None for p in pieces):
         return ()
     return tuple(
@@ -426,7 +426,7 @@ def _residuals(found: dict[str, Any] | None) -> ResidualStatistics:
 
 
 class Joint(enum.Enum):
-    """How each line has to begin where the one before ends."""
+    """The condition at each joint of two lines."""
 
     SAME = 'same number'
     NEARLY = 'but for rounding'
@@ -434,12 +434,12 @@ class Joint(enum.Enum):
 
 
 def check_pieces(pieces: list[dict[str, Any]], whole: str, path: str, joint: Joint) -> None:
-    """Refuse lines that do not follow each other, or lead where no plant is.
+    """Refuse lines that are not in sequence, or have values that no plant has.
 
     Raises
     ------
     DataError
-        The sentence names the place.
+        The message names the place.
     """
     for k, piece in enumerate(pieces):
         begin, before = piece['u_from'], pieces[k - 1] if k else None
@@ -470,7 +470,7 @@ def _check_intervals(top: dict[str, Any]) -> None:
     if len(intervals) != len(pieces) - 1:
         raise _fail('breakpoint_intervals', "must have one entry less than 'pieces'")
     for k, (low, high) in enumerate(intervals):
-        # Comparisons with NaN, what is not known, are false.
+        # Comparisons with NaN (unknown) are false.
         if low > pieces[k]['u_to'] or high < pieces[k]['u_to']:
             raise _fail(f'breakpoint_intervals[{k}]', 'does not hold its breakpoint')
 

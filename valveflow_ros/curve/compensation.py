@@ -14,18 +14,18 @@ from valveflow_ros.curve.characteristic import Characteristic, Piece, curve_erro
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.records import FloatArray
 
-# Which points of a rising broken line a short table keeps, and what that costs.
+# Choice of the points of a rising broken line that a short table keeps.
 
 
 def spread(x: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Put further points on a broken line until it has ``count``; every corner stays one.
+    """Add points to a broken line until it has ``count``; all corners are kept.
 
-    The widest interval of x is divided first. Intervals without width are not divided.
+    The widest interval of x is divided first. Intervals of zero width are not divided.
 
     Parameters
     ----------
     x, y : float64 (n,)
-        Corners; x does not fall.
+        Corners; x is not decreasing.
     """
     width = np.diff(x)
     parts = np.ones(len(width), dtype=np.int64)
@@ -46,10 +46,10 @@ def spread(x: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, FloatA
 
 
 def thin(x: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Keep ``count`` corners, both ends among them, so that the largest error in x is least.
+    """Keep ``count`` corners, including both ends, such that the largest error in x is minimal.
 
-    The error in x is what the line through the kept corners gives too much or too little at
-    the y of a corner that was left out. Exact: all choices are compared (dynamic programme).
+    The error in x is the difference of the line through the kept corners from an omitted
+    corner at the same y. The choice is exact (dynamic programming).
     """
     n = len(x)
     cost = np.full((n, n), np.inf)
@@ -75,7 +75,7 @@ def thin(x: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, FloatArr
 
 
 def _error(x: FloatArray, y: FloatArray, a: int, b: int) -> float:
-    """Return the largest error in x at the corners between two that are kept."""
+    """Return the largest error in x at the corners between two kept ones."""
     if b == a + 1:
         return 0.0
     if y[b] == y[a]:
@@ -84,23 +84,23 @@ def _error(x: FloatArray, y: FloatArray, a: int, b: int) -> float:
     return float(np.max(np.abs(line - x[a + 1 : b])))
 
 
-_JOINED_MW = 1e-6  # pieces whose ends differ by less meet: what is left is rounding
-_CHECKED = 20_001  # powers at which the inverse is tried
-_STEEP = 5.0  # a gain beyond this many times the least one is too large, unless told otherwise
+_JOINED_MW = 1e-6  # smaller differences of two pieces' ends are rounding, not jumps
+_CHECKED = 20_001  # number of powers at which the inverse is tested
+_STEEP = 5.0  # default gain limit, as a multiple of the smallest gain
 
 
 @dataclass(frozen=True, slots=True)
 class Compensation:
-    """Demanded power to integrated input.
+    """The table from demanded power to integrated input.
 
     Attributes
     ----------
     power_mw, u, u_stderr : float64 (n,)
-        The table: power rises, u does not fall; one standard error of u.
+        The table: power is increasing, u is not decreasing; one standard error of u.
     gain : float64 (n,)
-        Units of u per MW from this point to the next; the last repeats the one before.
+        Units of u per MW from this point to the next; the last value repeats the previous one.
     within : bool (n,)
-        The gain is within its limit.
+        True if the gain is within its limit.
     curve : Characteristic
         The part of the curve that was inverted.
     gains : float64 (J,)
@@ -111,13 +111,13 @@ class Compensation:
     useful_mw : tuple of float
         The widest range of power over which the gain stays within its limit.
     identity_mw : float
-        Largest ``|F(F^-1(x)) - x|`` over the whole range, jumps left out.
+        Largest ``|F(F^-1(x)) - x|`` over the whole range, without jumps.
     table_mw, table_u : float
-        Largest error that interpolating in the table as written has, in MW and in u.
+        Largest error of interpolation in the rounded table, in MW and in u.
     jumps : tuple of (float, float, float)
-        Where the curve jumps up: u, and the powers below and above.
+        Jumps of the curve: u, and the powers below and above.
     first_piece : int
-        Number that the first of these pieces has in the whole curve, from 1.
+        Number of the first of these pieces in the whole curve, from 1.
     notes : tuple of str
     """
 
@@ -153,23 +153,23 @@ def compensate(
     ----------
     curve : Characteristic
     points : int
-        Length of the table, 2 or more. Knots come first: with J + 1 or more points linear
-        interpolation of the table is exact; with fewer the knots are kept that make its
-        largest error in power least.
+        Length of the table, 2 or more. With J + 1 or more points the table contains all knots
+        and linear interpolation is exact; with fewer, those knots are kept that minimise
+        the largest error in power.
     gain_limit : float, optional
-        Units of u per MW beyond which the table is of no use; by default five times the
-        least gain of the curve.
+        Gain in units of u per MW above which the table is not useful; by default five times the
+        smallest gain of the curve.
     u_from, u_to : float
-        Leave out what lies outside.
+        The range of u; the rest of the curve is left out.
     places : int
-        Decimals of power and u in the table; the errors are those of the rounded numbers.
+        Decimals of power and u in the table; the reported errors include the rounding.
 
     Raises
     ------
     DataError
-        The curve does not rise throughout; the sentence names the piece and what to do.
+        The curve does not always rise; the message names the piece and gives advice.
     InputError
-        ``points`` or the range makes no table.
+        ``points`` or the range is invalid for a table.
     """
     if points < 2:
         raise InputError(f'A table needs 2 points or more, not {points}.')
@@ -219,7 +219,7 @@ def _end(piece: Piece, u: float) -> float:
 
 
 def _rises(curve: Characteristic, first: int) -> None:
-    """Refuse a curve that has no inverse."""
+    """Raise `DataError` if a curve has no inverse."""
     what = (
         'Identify from data in which the unit moves more there, or leave that part out with '
         '--u-from and --u-to.'
@@ -277,7 +277,7 @@ def _identity(curve: Characteristic) -> float:
         inside |= (powers >= low) & (powers <= high)
     powers = powers[~inside]
     back = curve.model.static(curve.inverse(powers))
-    # A power at the very end may lie a rounding error beyond what the curve reaches.
+    # A power at an end may exceed the range of the curve by a rounding error.
     back = np.where(np.isnan(back) & ((powers == x[0]) | (powers == x[-1])), powers, back)
     return float(np.max(np.abs(back - powers), initial=0.0))
 
@@ -285,7 +285,7 @@ def _identity(curve: Characteristic) -> float:
 def _table_errors(curve: Characteristic, x: FloatArray, u: FloatArray) -> tuple[float, float]:
     """Return the largest error of interpolating in the table, in MW and in u.
 
-    All three lines are straight between the corners, so the corners decide.
+    All three lines are straight between the corners, so the errors at the corners suffice.
     """
     corners_x, corners_u = _corners(curve)
     rises = np.append(True, np.diff(u) > 0.0)
@@ -304,7 +304,7 @@ def _table_errors(curve: Characteristic, x: FloatArray, u: FloatArray) -> tuple[
 
 
 def _u_error(curve: Characteristic, u: FloatArray) -> FloatArray:
-    """Return the standard error of F^-1: that of F through the slope; at a knot the larger."""
+    """Return the standard error of F^-1: that of F divided by the slope; at a knot the larger."""
     slopes = np.array([p.slope for p in curve.pieces])
     span = float(curve.breakpoints[-1] - curve.breakpoints[0])
     error = np.zeros(len(u))
@@ -323,7 +323,7 @@ def _largest_step(gains: FloatArray) -> float:
 
 
 def _useful(curve: Characteristic, gains: FloatArray, limit: float) -> tuple[float, float]:
-    """Return the widest range of power in which no piece has a gain beyond the limit."""
+    """Return the widest range of power in which no piece has a gain above the limit."""
     best, begun = (math.nan, math.nan), None
     for piece, gain in zip(curve.pieces, gains, strict=True):
         if gain > limit:
@@ -337,7 +337,7 @@ def _useful(curve: Characteristic, gains: FloatArray, limit: float) -> tuple[flo
 
 
 def _notes(made: Compensation, points: int, exact: int) -> tuple[str, ...]:
-    """Return what whoever enters the table has to know."""
+    """Return the notes for the user of the table."""
     notes = [
         f'Below {made.power_mw[0]:.2f} MW and above {made.power_mw[-1]:.2f} MW nothing is known '
         'of the valve: the controller must hold u at the end of the table there.'

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What JSON that somebody else may have written has to look like, as a table; `checked` holds it.
+"""Schema of JSON from untrusted files; `checked` validates a value by a schema.
 
 A schema is a dict of its keys, or one of the classes here. Every error names its place.
 """
@@ -17,7 +17,7 @@ from valveflow_ros.errors import DataError
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number from ``low`` to ``high``; with ``null`` also null, which is read as NaN."""
+    """A number from ``low`` to ``high``; with ``null`` also null, which becomes NaN."""
 
     low: float
     high: float
@@ -26,14 +26,14 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """A whole number from 0 to ``high``."""
+    """An integer from 0 to ``high``."""
 
     high: int = 2**53
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A text, of these words if any are given."""
+    """A text; one of ``words`` if they are given."""
 
     words: tuple[str, ...] = ()
 
@@ -45,7 +45,7 @@ class Flag:
 
 @dataclass(frozen=True, slots=True)
 class ListOf:
-    """A list of ``least`` to ``most`` entries; with ``rising`` each is above the one before."""
+    """A list of ``least`` to ``most`` entries; with ``rising`` they are strictly increasing."""
 
     of: Any
     least: int = 0
@@ -55,7 +55,7 @@ class ListOf:
 
 @dataclass(frozen=True, slots=True)
 class Members:
-    """An object of any keys; with ``pieces`` these are numbers of pieces."""
+    """An object with any keys; with ``pieces`` the keys are numbers of pieces."""
 
     of: Any
     pieces: bool = False
@@ -63,34 +63,34 @@ class Members:
 
 @dataclass(frozen=True, slots=True)
 class Maybe:
-    """What stands under a key that may be missing, which is read as None."""
+    """The value of an optional key; a missing key becomes None."""
 
     of: Any
     or_empty: bool = False
 
 
-# Where a plant can be, by the outer bounds of the parameters: -50 to 1000 % and 100 MPa to the
-# power of 2; a curve drawn beyond what was measured may be a hundred times off.
+# Possible values of a plant, from the outer bounds of the parameters: -50 to 1000 % and 100 MPa
+# to the power of 2; the power of an extrapolated curve may be a hundred times too large.
 U, MW, DEGC = (-5e5, 1e7), (-1e7, 1e7), (-273.15, 1000.0)
 NS = 2**63 - 1
 MOST_PIECES = 100
 
 
 def checked(value: Any, schema: Any, whole: str, path: str = '') -> Any:
-    """Return what stands in the JSON as the schema has it; what the schema lacks is left out.
+    """Return the JSON value validated by the schema; keys that the schema lacks are left out.
 
     Parameters
     ----------
     value : object
-        As `json.loads` gives it.
+        A value from `json.loads`.
     schema : object
     whole, path : str
-        What the sentence calls the file, and the place in it.
+        The name of the file in messages, and the place in it.
 
     Raises
     ------
     DataError
-        Something is missing or cannot be; the sentence names the place.
+        A value is missing or invalid; the message names the place.
     """
     place = whole, path
     if isinstance(schema, dict):
@@ -123,7 +123,7 @@ def checked(value: Any, schema: Any, whole: str, path: str = '') -> Any:
 
 
 def fail(whole: str, path: str, problem: str) -> DataError:
-    """Return the error that says what is wrong with a place."""
+    """Return an error that describes the problem at a place."""
     return DataError(f"The {whole} cannot be used: '{path}' {problem}.")
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The model that is fitted: a piecewise-linear curve and dynamics by region."""
+"""The fitted model: a piecewise-linear curve and dynamics by region."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class RegionalModel:
     Attributes
     ----------
     knots : float64 (J + 1,)
-        Boundaries of the pieces in % MPa^m; beyond the outer ones the outer pieces go on.
+        Boundaries of the pieces in % MPa^m; the outer pieces extend beyond the outer ones.
     left, right : float64 (J,)
         Flow in MW at the left and right end of each piece.
     levels : float64 (I - 1,)
-        Flow in MW at which one region gives way to the next.
+        Flow in MW at the boundaries between regions.
     time_constants, delays : float64 (I,)
-        Seconds. ``I = 0`` (empty) means the dynamics are not known.
+        Seconds. ``I = 0`` (empty) means that the dynamics are unknown.
     offset_mw : float or None
-        c of P = p^e F(V) + c; None where P = F(V p^m). With it, what is said in MW of pieces is
-        in MW / MPa^e, and of flow in MW.
+        c of P = p^e F(V) + c; None if P = F(V p^m). With an offset, the values of pieces are in
+        MW / MPa^e, and flows are in MW.
     """
 
     knots: FloatArray
@@ -51,7 +51,7 @@ class RegionalModel:
 
     @property
     def offset(self) -> float:
-        """Return c in MW, 0 where the form has none."""
+        """Return c in MW, 0 if the form has none."""
         return self.offset_mw or 0.0
 
     @property
@@ -61,7 +61,7 @@ class RegionalModel:
 
     @property
     def delay_places(self) -> slice:
-        """Return where the delays stand among the packed parameters."""
+        """Return the positions of the delays among the packed parameters."""
         first = 3 * self.pieces - 1 + self.regions
         return slice(first, first + self.regions)
 
@@ -79,12 +79,12 @@ class RegionalModel:
         Parameters
         ----------
         scale : float64, shape of ``u``, or float
-            p^e; 1 where P = F(u).
+            p^e; 1 if P = F(u).
         """
         return np.asarray(scale * self.shape(u) + self.offset)
 
     def shape(self, u: FloatArray) -> FloatArray:
-        """Evaluate F; NaN in gives NaN out, and so does an infinite u on a flat piece."""
+        """Evaluate F; NaN for NaN, and for an infinite u on a flat piece."""
         piece = np.clip(np.searchsorted(self.knots, u, side='right') - 1, 0, self.pieces - 1)
         width = np.diff(self.knots)[piece]
         w = (u - self.knots[piece]) / width
@@ -92,14 +92,14 @@ class RegionalModel:
             return np.asarray(self.left[piece] + (self.right - self.left)[piece] * w)
 
     def taps(self, step_s: float) -> FloatArray:
-        """Return the filter of each region as the kernels want it, shape (I, 7)."""
+        """Return the filter of each region in the form of the kernels, shape (I, 7)."""
         return make_taps(self.time_constants, self.delays, step_s)
 
     def respond(
         self, u: FloatArray, usable: ByteArray, step_s: float, settle_s: float,
         scale: FloatArray | float = 1.0,
     ) -> tuple[FloatArray, ByteArray]:  # fmt: skip
-        """Return the dynamic prediction in MW and where it has settled, shapes (n,)."""
+        """Return the dynamic prediction in MW and a mask of settled rows, shapes (n,)."""
         answer = np.empty(len(u))
         settled = np.empty(len(u), dtype=np.uint8)
 
@@ -110,7 +110,7 @@ class RegionalModel:
         return answer, settled
 
     def with_levels(self, levels: FloatArray) -> RegionalModel:
-        """Return a copy that switches elsewhere."""
+        """Return a copy with other boundaries between the regions."""
         return replace(self, levels=np.asarray(levels, dtype=np.float64))
 
     def pack(self) -> FloatArray:
@@ -131,7 +131,7 @@ class RegionalModel:
         knots[1:-1] = inner
         left = values[:-1].copy()
         left[1:] += jumps
-        with np.errstate(over='ignore'):  # a step of the fit that went too far; it is not taken
+        with np.errstate(over='ignore'):  # a too large step of the fit, which will be rejected
             time_constants = np.exp(rest[:i])
         return replace(
             self, knots=knots, left=left, right=values[1:].copy(),
@@ -144,7 +144,7 @@ class RegionalModel:
 #
 # The model is eqs. (2)-(5) of the paper with K_g = 1: x = F(u), and G_i of eq. (3)
 # in the region i that x(t) lies in, discretised exactly for a flow that is
-# straight between two rows: ``y[t] = a y[t-1] + b x(t-h-tau) + c x(t-tau)`` with
+# linear between two rows: ``y[t] = a y[t-1] + b x(t-h-tau) + c x(t-tau)`` with
 # ``a = exp(-h/T)``, ``b = (1-a) T/h - a`` and ``c = 1 - (1-a) T/h``. Delays need not be
 # whole steps; with the two rows around each delayed instant that makes three
 # taps.
@@ -152,7 +152,7 @@ class RegionalModel:
 
 @jit
 def piece_of(u: float, knots: FloatArray) -> int:
-    """Return the piece ``u`` lies in; the outer pieces go on for ever."""
+    """Return the piece of ``u``; the outer pieces extend to infinity."""
     k = 0
     while k < knots.size - 2 and u >= knots[k + 1]:
         k += 1
@@ -176,7 +176,7 @@ def region_of(x: float, levels: FloatArray) -> int:
     return r
 
 
-# Columns of a table of taps, one row a region: decay, weights of the flows at `TAP_WHOLE`
+# Columns of a table of taps, one row per region: decay, weights of the flows at `TAP_WHOLE`
 # steps back and one and two before, b and c as above.
 TAP_A, TAP_0, TAP_1, TAP_2, TAP_WHOLE, TAP_B, TAP_C = range(7)
 TAPS = 7
@@ -203,11 +203,11 @@ def make_taps(time_constants: FloatArray, delays: FloatArray, step_s: float) -> 
 
 @jit
 def lag_step(flow: FloatArray, at: int, age: int, tap: FloatArray, state: float) -> float:
-    """Return the power of a row from that of the row before, ``state``.
+    """Return the power of a row from that of the previous row, ``state``.
 
-    ``flow`` holds the flow of this row at ``at`` and those before it at lower places, a negative
-    place counting from the end: so a ring of past flows will do. ``age`` rows lie between this
-    row and the last gap; before the gap the flow is taken for that behind it.
+    ``flow[at]`` is the flow of this row; earlier flows have lower indices. A negative index
+    counts from the end, so ``flow`` may be a ring buffer. ``age`` is the number of rows since the
+    last gap; the flow before the gap is assumed equal to the first one after it.
     """
     whole = int(tap[TAP_WHOLE])
     return float(
@@ -230,7 +230,7 @@ def respond(
 ) -> None:
     """Filter the flow ``x`` (n,) into the power ``answer`` (n,).
 
-    After a gap the filter starts in equilibrium, and
+    After a gap the filter starts in steady state, and
     ``settled`` is 0 for ``settle`` rows.
     """
     state = 0.0
@@ -253,7 +253,7 @@ def respond(
 def whiten(series: FloatArray, weight: ByteArray, ar: FloatArray, out: FloatArray) -> int:
     """Write the innovations of ``series`` (m,) under AR coefficients ``ar``.
 
-    Rows whose history is not complete are left out; returns the rows written.
+    Rows without a complete history are left out; return the number of rows written.
     """
     order = ar.size
     written = 0
@@ -271,7 +271,7 @@ def whiten(series: FloatArray, weight: ByteArray, ar: FloatArray, out: FloatArra
 
 @jit
 def lagged_products(series: FloatArray, weight: ByteArray, order: int) -> FloatArray:
-    """Return mean products at lags 0..order over pairs of weighted rows."""
+    """Return mean products at lags 0 to ``order`` over pairs of weighted rows."""
     out = np.zeros(order + 1)
     count: IntArray = np.zeros(order + 1, dtype=np.int64)
     for t in range(series.size):

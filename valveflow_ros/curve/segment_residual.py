@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""By how much each special segment differs from a curve, from the segments' records alone."""
+"""The difference of each special segment from a curve, from the segments' records only."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.signals.static_form import StaticForm
 
-# At which moment a series changed its mean, and how sure that is.
+# The time at which a series changed its mean, and the p-value of the change.
 
-LEAST_SIDE = 4  # members on either side of a change
+LEAST_SIDE = 4  # minimum members on each side of a change
 _LARGEST_RHO = 0.9
-_LEAST_VARIANCE = 1e-200  # without any noise; z^2 stays a number
-_FAR = 38.0  # normal deviates whose density is no number any more
+_LEAST_VARIANCE = 1e-200  # keeps z^2 finite without noise
+_FAR = 38.0  # normal deviate beyond which the density underflows
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One change of the mean, looked for at every place.
+    """One change of the mean, tested at every position.
 
     Attributes
     ----------
     place : int
         Members before the change.
     p_value : float
-        Chance of so clear a change anywhere, if there were none.
+        Probability of such a change at any position if there is none.
     before, after : float
-        Weighted means on both sides, the unit of the series.
+        Weighted means on both sides, in the unit of the series.
     after_error : float
         Standard error of ``after``.
     likelihood : float64 (n + 1,)
-        Log-likelihood of a change after so many members, against none; -inf where not tried.
+        Log-likelihood of a change after k members, relative to no change; -inf if not tested.
     """
 
     place: int
@@ -57,24 +57,24 @@ class Scan:
 
 
 def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None:
-    """Look for one change of the mean; None for a series too short to have one.
+    """Test for one change of the mean; return None if the series is too short.
 
     Parameters
     ----------
     values : float64 (n,)
-        In order of time.
+        In chronological order.
     weights : float64 (n,)
         Inverse variances up to a factor.
     first : int
-        Changes with fewer members before them are not looked for.
+        Changes with fewer members before them are not tested.
 
     Notes
     -----
-    The statistic is the two-sample z of each split, its variance taken at the best split
-    and widened for the correlation of neighbours that is left there. The chance of its
-    maximum under no change is the one of a standardised Brownian bridge (James, James and
+    The statistic is the two-sample z of each split. Its variance is that at the best split,
+    increased for the remaining correlation of neighbours. The distribution of its maximum
+    without a change is that of a standardised Brownian bridge (James, James and
     Siegmund 1987), ``b phi(b) ((1 - b^-2) log T + 4 b^-2)`` with
-    ``T = s1 (1 - s0) / (s0 (1 - s1))`` for splits between the shares s0 and s1 of the weight.
+    ``T = s1 (1 - s0) / (s0 (1 - s1))`` for splits between the fractions s0 and s1 of the weight.
     """
     n = len(values)
     first = max(first, LEAST_SIDE)
@@ -102,12 +102,12 @@ def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None
 
 
 def _variance(rest: FloatArray, weights: FloatArray) -> float:
-    """Return the variance of a member of weight 1."""
+    """Return the variance of a member with weight 1."""
     return max(float(np.sum(weights * rest**2)) / max(len(rest) - 2, 1), _LEAST_VARIANCE)
 
 
 def _widening(rest: FloatArray) -> float:
-    """Return by how much correlation of neighbours widens the variance of a long mean."""
+    """Return the factor by which lag-one correlation increases the variance of a long mean."""
     power = float(np.sum(rest**2))
     if power <= 0.0:
         return 1.0
@@ -117,15 +117,15 @@ def _widening(rest: FloatArray) -> float:
 
 
 def _as_normal(t: float, freedom: int) -> float:
-    """Return the normal deviate as rare as ``t`` of Student's distribution."""
+    """Return the normal deviate with the tail probability of Student's ``t``."""
     chance = float(stdtr(freedom, -t))
     tail = math.log(chance) if chance > 0.0 else -math.inf
-    # Far out the tail of the normal is log-quadratic; its inverse there is not in the tables.
+    # Far in the tail `ndtri` fails; the log of the normal tail is about quadratic there.
     return float(-ndtri(math.exp(tail))) if tail > -600.0 else math.sqrt(-2.0 * tail)
 
 
 def _chance(b: float, low: float, high: float) -> float:
-    """Return the chance that the maximum over splits exceeds ``b``."""
+    """Return the probability that the maximum over splits exceeds ``b``."""
     if b < 1.0:
         return 1.0
     if b > _FAR:
@@ -138,29 +138,29 @@ def _chance(b: float, low: float, high: float) -> float:
 def moment_of(
     times_ns: list[IntArray], scans: list[Scan], share: float = 0.95
 ) -> tuple[int, int, int]:
-    """Return when several series changed together, with the ends of an interval.
+    """Return the common time of change of several series, with an interval.
 
     Parameters
     ----------
     times_ns : list of int64 (n,)
         Times of the members of each series.
     scans : list of Scan
-        One a series, at least one.
+        One per series, at least one.
     share : float
-        Of the probability inside the interval.
+        Probability of the interval.
 
     Returns
     -------
     tuple of int
-        Median, lower and upper end of the time's distribution, ns. Before the data every
-        moment between two members is taken to be as likely as any other, by its length.
-        Series without a moment in common did not change together: then the surest of them
-        tells. 0, 0, 0 if no moment can be told.
+        Median, lower and upper end of the distribution of the time, ns. The prior is uniform
+        in time. If the series have no possible time in common they did not change together:
+        then only the series with the smallest p-value is used. 0, 0, 0 if the time cannot
+        be determined.
     """
     edges = np.unique(np.concatenate(times_ns))
     likelihood = np.zeros(len(edges) - 1)
     for times, found in zip(times_ns, scans, strict=True):
-        # A change inside ]edge, next edge[ leaves so many members of this series before it.
+        # Number of members of this series before a change between two edges.
         count = np.searchsorted(times, edges[:-1], side='right')
         likelihood += found.likelihood[count]
     if not np.isfinite(likelihood).any():
@@ -177,13 +177,13 @@ def moment_of(
 
 
 _MOST_WEIGHT = 900.0
-_KNOWN = 0.01  # chance below which a change within the reference's data is taken for one
-_POINTS = 64  # along a ramp, for the mean of a curve with knees
+_KNOWN = 0.01  # p-value below which a change within the reference's data is accepted
+_POINTS = 64  # points along a ramp, for the mean of a curve with breakpoints
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentResiduals:
-    """Segments against one curve, in order of time; all arrays have shape (n,).
+    """Residuals of segments about one curve, sorted by time; all arrays have shape (n,).
 
     Attributes
     ----------
@@ -192,7 +192,7 @@ class SegmentResiduals:
     u : float64
         Middle of the segment, % MPa^m.
     residual_mw : float64
-        Mean power less what the curve gives.
+        Mean power minus the power of the curve.
     samples : int64
     """
 
@@ -209,13 +209,13 @@ class SegmentResiduals:
     def weights(self) -> FloatArray:
         """Return inverse variances up to a factor, shape (n,).
 
-        A longer segment averages its own noise away, but not the slow disturbances that
-        long and short ones share.
+        A longer segment averages its own noise, but not the slow disturbances. So the weight
+        has an upper limit.
         """
         return np.minimum(self.samples.astype(np.float64), _MOST_WEIGHT)
 
     def inside(self, low: float, high: float) -> SegmentResiduals:
-        """Return the segments whose middle lies in ``[low, high)``."""
+        """Return the segments with their middle in ``[low, high)``."""
         return self.part((self.u >= low) & (self.u < high))
 
     def count_until(self, time_ns: int) -> int:
@@ -234,9 +234,9 @@ def segment_residuals(
 ) -> SegmentResiduals:
     """Return the mean residual of each segment inside the curve's range.
 
-    On a ramp the power lags by ``K_f eta_1 (T + tau)``, the term eq. (14) of the paper
-    drops: it is taken off with the dynamics of the curve. A curve without dynamics judges
-    steady-state segments only.
+    On a ramp the power lags by ``K_f eta_1 (T + tau)``, the term that eq. (14) of the paper
+    neglects: it is computed from the dynamics of the curve and removed. With a curve without
+    dynamics only steady-state segments are used.
     """
     known = bool(curve.dynamics)
     knots = curve.breakpoints
@@ -261,14 +261,14 @@ def segment_residuals(
 
 
 class _Ends(NamedTuple):
-    """What a curve is a function of at both ends of a segment, and what it is multiplied by."""
+    """The argument and the factor of a curve at both ends of a segment."""
 
     u: FloatArray
     scale: FloatArray
 
 
 def _ends(form: StaticForm, segment: SpecialSegment) -> _Ends:
-    """Return the ends of a segment on the axis of a curve; NaN where they are not known."""
+    """Return the ends of a segment on the axis of a curve; NaN if they are unknown."""
     s = segment
     if not form.scaled and (math.isnan(s.exponent) or s.exponent == form.exponent):
         return _Ends(np.array([s.u_start, s.u_end]), np.ones(2))
@@ -283,7 +283,7 @@ def _expected(
     curve: Characteristic, segments: Sequence[SpecialSegment], ends: FloatArray,
     scales: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Return the mean power the curve gives along each segment; both (k, 2)."""
+    """Return the mean power of the curve along each segment; ``ends``, ``scales``: (k, 2)."""
     if not segments:
         return np.empty(0)
     model = curve.model
@@ -306,14 +306,14 @@ def _expected(
 
 
 def after_known_changes(series: SegmentResiduals, known_ns: int) -> SegmentResiduals:
-    """Return the segments from the last change on that lies before a time.
+    """Return the segments after the most significant change before a time.
 
     Parameters
     ----------
     series : SegmentResiduals
     known_ns : int
-        End of the reference's data: what changed before it is in the reference, and is no
-        shift away from it.
+        End of the reference's data: a change before it is contained in the reference, and is no
+        shift relative to it.
     """
     known = series.part(np.arange(series.count_until(known_ns)))
     found = scan(known.residual_mw, known.weights)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Has the flow characteristic moved away from a reference: which piece, how far, since when."""
+"""Test for a shift of the flow characteristic from a reference: piece, size and onset."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from valveflow_ros.curve.segment_residual import (
 from valveflow_ros.errors import DataError, short
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
 
-# The judgement of a shift in words an operator understands.
+# The result of the test as a sentence for the operator.
 
 _SURE = 0.9999
 
 
 def shift_sentence(shift: Shift, knots: FloatArray) -> str:
-    """Say which piece moved, by how much, since when and how surely; or that none did.
+    """Return a sentence on the piece that shifted, the size, onset and confidence; or on no shift.
 
     Parameters
     ----------
     shift : Shift
     knots : float64 (J + 1,)
-        Of the reference; less of it than all may have been compared.
+        Of the reference; possibly only a part of it was compared.
     """
     return _judgement(shift) + _compared(shift, float(knots[0]), float(knots[-1]))
 
 
 def _compared(shift: Shift, first: float, last: float) -> str:
-    """Say what was compared if it is not the whole reference."""
+    """Return a sentence on the compared range if it is not the whole reference."""
     known = [p for p in shift.pieces if math.isfinite(p.u_from)]
     low, high = min(p.u_from for p in known), max(p.u_to for p in known)
     if low <= first and high >= last:
@@ -83,12 +83,12 @@ def _judgement(shift: Shift) -> str:
 
 
 def day(time_ns: int) -> str:
-    """Write a date; a time that is not known says so."""
+    """Return a date as text; 'unknown date' for an unknown time."""
     return _at(time_ns, 'D') if time_ns > 0 else 'unknown date'
 
 
 def minute(time_ns: int) -> str:
-    """Write a date with hours and minutes, UTC."""
+    """Return a date with hours and minutes as text, UTC."""
     return _at(time_ns, 'm').replace('T', ' ') + ' UTC'
 
 
@@ -124,39 +124,39 @@ def _others(shift: Shift, numbers: list[int]) -> str:
     return f' {told[0].upper()}{told[1:]} too.'
 
 
-# The errors of curves assume that samples spread evenly over a piece and that all noise is
-# soon forgotten. With a slow wander of 1 MW differences of clean plants were 1.8 times larger
-# (benchmarks/shift_study.py --wander 1, seeds 1 to 5), without one not at all (seeds 1 to 12).
+# The errors of curves assume uniform samples over a piece and noise with a short correlation
+# time. With slow noise of 1 MW, differences of clean plants were 1.8 times larger than these
+# errors (benchmarks/shift_study.py --wander 1, seeds 1 to 5); without it not (seeds 1 to 12).
 _WIDER = 1.8
 _PROFILE = 101  # points along a piece
-# A change within the data of a curve is told where it is as sure as this.
+# Limits of p-value and standard errors for reporting a change within the data of a curve.
 _MIXED_CHANCE, _MIXED_ERRORS = 1e-4, 3.0
-_TESTS = 2  # each piece is judged by the curves and by its segments
+_TESTS = 2  # each piece is tested by the curves and by its segments
 
 
 @dataclass(frozen=True, slots=True)
 class PieceShift:
-    """A piece of the current curve against the reference.
+    """Comparison of a piece of the current curve with the reference.
 
     Attributes
     ----------
     u_from, u_to : float
-        The part of the piece on which both curves are known; NaN if there is none.
+        The part of the piece in the range of both curves; NaN if there is none.
     middle_mw, low_mw, high_mw : float
-        Current less reference: in the middle, and the extremes along the piece.
+        Current minus reference: in the middle, and the extremes along the piece.
     error_mw : float
         Standard error of ``middle_mw``.
     now_mw, now_error_mw : float
-        Mean difference of the segments after the change, or of all the curve was fitted to if
-        they do not show when it was, with its error; NaN if the piece has not moved, or has none.
+        Mean difference of the segments after the change with its error, or of all segments of the
+        curve if the time is unknown; NaN if the piece has not shifted, or has no segments.
     flow_mw : float
-        The reference in the middle.
+        Power of the reference in the middle.
     p_value : float
-        Chance of such a difference without a shift, for all pieces and both tests together.
+        Probability of such a difference without a shift, corrected for all pieces and tests.
     moved : bool
-        The chance is below the limit, and the shift is large enough to matter.
+        True if the p-value is below the limit, and the shift is at least the minimum size.
     smallest_mw : float
-        The smallest shift that would have been judged one.
+        The smallest shift that would have been detected.
     """
 
     u_from: float
@@ -174,7 +174,7 @@ class PieceShift:
 
     @property
     def shift_mw(self) -> float:
-        """Return the shift as it is now: the window may hold data from before the change."""
+        """Return the present shift: the window may contain data from before the change."""
         return self.now_mw if math.isfinite(self.now_mw) else self.middle_mw
 
     @property
@@ -190,7 +190,7 @@ class PieceShift:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """The judgement.
+    """The result of the test.
 
     Attributes
     ----------
@@ -198,14 +198,14 @@ class Shift:
     reference_ns : int
         End of the reference's data.
     first_ns : int
-        The oldest segment judged; 0 without any.
+        Time of the oldest segment used; 0 without any.
     pieces : tuple of PieceShift
-        One a piece of the current curve.
+        One per piece of the current curve.
     since_ns, since_low_ns, since_high_ns : int
-        When the pieces that moved did so, with a 95 % interval; 0 where the segments do
-        not show it, as when it was before the first of them.
+        Onset of the shift, with a 95 % interval; 0 if the segments do not determine it, for
+        example if it was before the first of them.
     sentence : str
-        For the operator.
+        The result for the operator.
     """
 
     reference_id: str
@@ -220,26 +220,26 @@ class Shift:
 
     @property
     def moved(self) -> bool:
-        """Tell whether any piece moved."""
+        """Return True if any piece shifted."""
         return any(p.moved for p in self.pieces)
 
     @property
     def largest(self) -> PieceShift | None:
-        """Return the piece that moved most; None if none did."""
+        """Return the piece with the largest shift; None if there is none."""
         moved = [p for p in self.pieces if p.moved]
         return max(moved, key=lambda p: abs(p.shift_mw)) if moved else None
 
 
 @dataclass(frozen=True, slots=True)
 class ShiftLimits:
-    """What counts as a shift.
+    """The limits of the test.
 
     Attributes
     ----------
     confidence : float
-        At least this sure, 0.5 to 1, over all pieces together.
+        Required confidence, 0.5 to 1, for all pieces together.
     least_mw : float
-        Smaller shifts do not matter, however sure.
+        Smaller shifts are ignored.
     """
 
     confidence: float = 0.999
@@ -252,24 +252,24 @@ def judge_shift(
     segments: Sequence[SpecialSegment] = (),
     limits: ShiftLimits | None = None,
 ) -> Shift:
-    """Judge the current curve against a reference.
+    """Test the current curve for a shift from a reference.
 
     Parameters
     ----------
     reference, current : Characteristic
-        Errors that windows in common would make alike are taken as independent, which
-        makes the difference look less sure than it is.
+        Their errors are assumed independent. If their windows overlap, the error of the
+        difference is therefore overestimated.
     segments : sequence of SpecialSegment
-        Of the current window; they tell since when, and what was before and after.
-        Segments that the reference does not reach count for nothing, nor do changes
+        Of the current window; they determine the onset, and the levels before and after.
+        Segments outside the range of the reference are ignored, and so are changes
         within the reference's own data.
     limits : ShiftLimits, optional
 
     Returns
     -------
     Shift
-        A piece counts as moved if the curves differ in its middle and its segments bear it out,
-        or if its segments change at some moment and differ from the reference after it.
+        A piece has shifted if the curves differ in its middle and its segments confirm this,
+        or if its segments change at some time and differ from the reference after it.
 
     Raises
     ------
@@ -279,7 +279,7 @@ def judge_shift(
     limits = limits or ShiftLimits()
     _comparable(reference, current)
     found = segment_residuals(reference, segments)
-    # Curves are held against each other at one pressure, at which their power is F(u) alone.
+    # Curves are compared at one pressure, at which their power is F(u).
     pressure = reference.shown_at_mpa
     reference, current = reference.at_pressure(pressure), current.at_pressure(pressure)
     series = [
@@ -312,13 +312,13 @@ def judge_shift(
 
 
 def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) -> str:
-    """Say that the unit changed within the data of a curve, which is then neither; or nothing.
+    """Return a sentence if the unit changed within the data of a curve; otherwise an empty text.
 
     Parameters
     ----------
     curve : Characteristic
     segments : sequence of SpecialSegment
-        Those that it was fitted to.
+        Those to which the curve was fitted.
     """
     found = segment_residuals(curve, segments)
     change = scan(found.residual_mw, found.weights)
@@ -363,7 +363,7 @@ def _comparable(reference: Characteristic, current: Characteristic) -> None:
 
 
 def _common(reference: Characteristic, piece: Piece) -> tuple[float, float] | None:
-    """Return the part of a piece of the current curve that the reference knows."""
+    """Return the part of a piece of the current curve in the range of the reference."""
     knots = reference.breakpoints
     low = max(float(knots[0]), piece.u_from)
     high = min(float(knots[-1]), piece.u_to)
@@ -379,13 +379,13 @@ def _judged(
     tests: int,
     limits: ShiftLimits,
 ) -> PieceShift:
-    """Judge one piece by the curves and by its segments, whose times are given."""
+    """Test one piece by the curves and by its segments, whose times are ``time_ns``."""
     common = _common(reference, current.pieces[index])
     if common is None:
         nan = math.nan
         return PieceShift(nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, False, nan)
     u = np.linspace(*common, _PROFILE)
-    # At the ends of a piece the neighbour's value would count after a jump.
+    # The end points are left out: after a jump they have the neighbour's value.
     difference = (current.model.static(u) - reference.model.static(u))[1:-1]
     middle = u[_PROFILE // 2 : _PROFILE // 2 + 1]
     middle_mw = float(difference[_PROFILE // 2 - 1])
@@ -422,9 +422,9 @@ def _with_now(
     reference: Characteristic, piece: PieceShift, series: SegmentResiduals, since_ns: int,
     least: int,
 ) -> PieceShift:  # fmt: skip
-    """Return a piece that moved with what its segments say after the common moment."""
+    """Return a shifted piece with the mean of its segments after the common time of change."""
     after = series.part(series.time_ns > since_ns)
-    # A series that begins after that moment changed at one of its own.
+    # A series that begins after that time has its own time of change.
     own = math.isfinite(piece.now_mw) and len(series) - len(after) < LEAST_SIDE
     if not piece.moved or own or len(after) < least:
         return piece
@@ -443,9 +443,9 @@ def _with_now(
 def _borne_out(
     piece: PieceShift, series: SegmentResiduals, since_ns: int, least_mw: float
 ) -> PieceShift:
-    """Return a piece as not moved if its own segments lie on the reference, or it has none.
+    """Return a piece as not shifted if its segments agree with the reference, or it has none.
 
-    A curve may bend where there are few segments, and differ there by much.
+    A curve may be wrong where there are few segments, and differ there by much.
     """
     if math.isfinite(piece.now_mw):
         borne_out = abs(piece.now_mw) >= least_mw
@@ -455,7 +455,7 @@ def _borne_out(
 
 
 def _reference_error(reference: Characteristic, u: FloatArray) -> float:
-    """Return the error of the reference at one u, with that of the days it was made from."""
+    """Return the error of the reference at one u, including the variation from day to day."""
     source = reference.source
     level_error = level_error_mw(
         reference.residuals.wander_mw, source.window_start_ns, source.window_end_ns
@@ -464,7 +464,7 @@ def _reference_error(reference: Characteristic, u: FloatArray) -> float:
 
 
 def _two_sided(value: float, error: float) -> float:
-    """Return the chance of a normal deviate as large as ``value``; 1 where it is not known."""
+    """Return the two-sided p-value of ``value`` with a normal ``error``; 1 if unknown."""
     if not (math.isfinite(value) and error > 0.0):
         return 1.0
     return float(2.0 * ndtr(-abs(value) / error))
@@ -473,7 +473,7 @@ def _two_sided(value: float, error: float) -> float:
 def _since(
     pieces: Sequence[PieceShift], series: Sequence[SegmentResiduals], scans: Sequence[Scan | None]
 ) -> tuple[int, int, int]:
-    """Return when the pieces that moved changed, by their segments together."""
+    """Return the common onset of the shifted pieces from their segments."""
     times: list[IntArray] = []
     used: list[Scan] = []
     for piece, residuals, found in zip(pieces, series, scans, strict=True):
@@ -483,7 +483,7 @@ def _since(
     return moment_of(times, used) if used else (0, 0, 0)
 
 
-# The judgement of a shift as JSON: what ``shift.json`` holds.
+# The result of the test as JSON: the content of ``shift.json``.
 
 FORMAT = 'valveflow/shift'
 VERSION = 1
@@ -514,7 +514,7 @@ def _piece_json(piece: PieceShift) -> dict[str, Any]:
 
 
 def shift_json(shift: Shift) -> dict[str, Any]:
-    """Return the content of ``shift.json``; what is not known is null."""
+    """Return the content of ``shift.json``; unknown values are null."""
     return {
         'format': FORMAT,
         'version': VERSION,

@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The joint fit of curve and dynamics, its uncertainty, and the manual step test."""
+"""Joint fit of curve and dynamics, its uncertainty, and the manual step test."""

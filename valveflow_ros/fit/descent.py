@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Damped Gauss-Newton and searches along a line, for any model whose cost is a sum of squares."""
+"""Levenberg-Marquardt and line searches for any model whose cost is a sum of squares."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from valveflow_ros.records import FloatArray
 Model = TypeVar('Model')
 
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-8
-# A parameter whose derivative is below this share of the largest is not moved.
+# A parameter is kept fixed if its derivative is below this fraction of the largest one.
 _DEAD = 1e-9
 
 
@@ -28,7 +28,7 @@ def gauss_newton(
     trials: int = 6,
     least_gain: float = 1e-7,
 ) -> tuple[Model, float]:
-    """Lower the cost by Levenberg-Marquardt steps.
+    """Minimise the cost by Levenberg-Marquardt steps.
 
     Parameters
     ----------
@@ -38,24 +38,24 @@ def gauss_newton(
     equations : callable
         Returns the normal matrix (P, P) and the products of tangents and residual (P,).
     shifted : callable
-        Returns the model moved by a step (P,), or None if that model is not possible.
+        Returns the model changed by a step (P,), or None if the changed model is invalid.
     steps : int
-        Most steps taken.
+        Maximum number of steps.
     trials : int
-        Dampings tried for a step, each ten times the one before.
+        Maximum number of damping values per step, each ten times the previous one.
     least_gain : float
-        The search ends when a step lowers the cost by less than this share of it.
+        The search ends when a step lowers the cost by less than this fraction of it.
 
     Returns
     -------
     model : Model
-        The best one found.
+        The best model found.
     cost : float
 
     Notes
     -----
-    Parameters are scaled to a normal matrix with a diagonal of one (Marquardt, J. SIAM 11,
-    1963), so that one damping serves MW, seconds and units of u.
+    Parameters are scaled so that the normal matrix has a diagonal of one (Marquardt, J. SIAM
+    11, 1963). One damping is then suitable for MW, seconds and units of u.
     """
     cost, damping = cost_of(model), _FIRST_DAMPING
     for _ in range(steps):
@@ -83,7 +83,7 @@ def descend(
     cost_of: Callable[[Model], float],
     moved: Callable[[Model], Model | None],
 ) -> tuple[Model, float]:
-    """Repeat one move while the cost falls; None says that the move is not possible."""
+    """Repeat one change while the cost falls; ``moved`` returns None if the change is invalid."""
     while (trial := moved(model)) is not None:
         value = cost_of(trial)
         if not value < cost:

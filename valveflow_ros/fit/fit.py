@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From a window of rows to a flow characteristic: a pure function of its input."""
+"""Fit a flow characteristic to a window of rows: a pure function of its input."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from valveflow_ros.records import ByteArray, FloatArray, IntArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, StaticForm, pressure_of
 
-_RICHER = 3  # pieces more than the paper's rule takes, before pruning
+_RICHER = 3  # additional pieces beyond the paper's rule, before pruning
 
 
 Progress = Callable[[str], None]
@@ -47,9 +47,9 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class _Formed:
-    """A task whose ``contents.u`` is what the curve is a function of, and the form's other parts.
+    """A task whose ``contents.u`` is the argument of the curve, and the other parts of the form.
 
-    ``scale`` (n,) is p^e; without it the power is F(u). ``held``: e stays as it is.
+    ``scale`` (n,) is p^e; without it the power is F(u). ``held``: e is kept fixed.
     """
 
     task: FitTask
@@ -61,7 +61,7 @@ class _Formed:
 
     @property
     def free_exponent(self) -> float | None:
-        """Return e where it is to be found along with the curve."""
+        """Return e if it is to be fitted with the curve, else None."""
         return None if self.held or not self.form.scaled else self.form.exponent
 
     @property
@@ -74,13 +74,13 @@ class _Formed:
         return 1.0 if self.scale is None else self.scale[rows]
 
     def static(self, pieces: tuple[Piece, ...], rows: IntArray | slice) -> FloatArray:
-        """Return the power of a curve in rows, MW."""
+        """Return the power of a curve at rows, MW."""
         return self.scales(rows) * evaluate(pieces, self.contents.u[rows]) + self.offset_mw
 
 
 @dataclass(frozen=True, slots=True)
 class _Begun:
-    """The exact partition of the special segments, and the static curve taken from it."""
+    """The exact partition of the special segments, and its static curve."""
 
     formed: _Formed
     static: Characteristic
@@ -94,7 +94,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     Raises
     ------
     DataError
-        The data do not carry a curve; the sentence says why and what would help.
+        The data determine no curve; the message says why and what would help.
     """
     begun = _begin(task, progress)
     task = begun.formed.task
@@ -104,7 +104,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
 
 
 def form_of_data(task: FitTask) -> StaticForm:
-    """Return the form that the rows of a task ask for; the paper's where they cannot tell."""
+    """Return the form that the rows of a task require; the paper's if they do not decide."""
     try:
         return _formed(task).form
     except DataError:
@@ -112,7 +112,7 @@ def form_of_data(task: FitTask) -> StaticForm:
 
 
 def form_contradicted(task: FitTask, given: StaticForm) -> bool:
-    """Return whether the rows of a task tell that the static power has another form."""
+    """Return True if the rows of a task show that the static power has another form."""
     found = _formed(replace(task, form=given)).evidence
     return found is not None and found.contradicted
 
@@ -122,13 +122,13 @@ def outline(
 ) -> tuple[RegionalModel, StaticForm]:
     """Find curve and dynamics without the last fit on single rows and without errors.
 
-    A start for those who fit everything themselves, in two thirds of the time of `fit`. The
-    form is that of the task, or the one the data ask for.
+    This is a start for a caller with a fit of its own, in two thirds of the time of `fit`.
+    The form is that of the task, or the one that the data require.
 
     Raises
     ------
     DataError
-        The data do not carry a curve, or no dynamics; the sentence says why.
+        The data determine no curve or no dynamics; the message says why.
     """
     begun = _begin(task, progress)
     progress('curve and dynamics together')
@@ -181,7 +181,7 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
 
 
 def _formed(task: FitTask) -> _Formed:
-    """Choose the form, unless the task or a parameter gives it, and put the rows into it."""
+    """Choose the form, unless the task or a parameter gives it, and convert the rows to it."""
     contents, exponent = task.contents, task.settings.real('pressure_exponent')
     paper = _Formed(task, StaticForm(INTEGRATED_INPUT, exponent))
     if not len(contents.opening_percent):
@@ -197,7 +197,7 @@ def _formed(task: FitTask) -> _Formed:
     u, scale = found.form.of_rows(contents.opening_percent, pressure)
     if found.form == paper.form:
         return replace(paper, evidence=found.evidence)
-    # The noise of u is told in the unit of the axis.
+    # The noise of u must be in the unit of the axis.
     rows = contents.special_rows()
     with np.errstate(invalid='ignore', divide='ignore'):
         ratio = float(np.nanmedian(u[rows] / contents.u[rows]))
@@ -215,7 +215,7 @@ def _formed(task: FitTask) -> _Formed:
 
 
 def _pressure(task: FitTask, rows: IntArray) -> float:
-    """Return the median pressure in rows, NaN where it is not known."""
+    """Return the median pressure of rows, NaN if unknown."""
     if not len(task.contents.opening_percent):
         return math.nan
     c = task.contents
@@ -226,7 +226,7 @@ def _pressure(task: FitTask, rows: IntArray) -> float:
 
 
 def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Piece, ...]:
-    """Return a partition's pieces, their errors widened for correlation in time."""
+    """Return a partition's pieces; their errors are widened for correlation in time."""
     wider = math.sqrt(inflation)
     return tuple(
         Piece(p.u_from, p.u_to, p.slope, p.intercept, p.slope_stderr * wider,
@@ -236,10 +236,10 @@ def _pieces_of(part: Partition, pieces: int, inflation: float = 1.0) -> tuple[Pi
 
 
 def _inflation(formed: _Formed, part: Partition) -> float:
-    """Return how much correlation in time widens the errors of this fit.
+    """Return the factor by which correlation in time increases the variances of this fit.
 
-    Judged on the residual of the richest partition, so that a missing piece is
-    not taken for correlation, within segments only.
+    It is estimated within segments from the residual of the partition with the most
+    pieces, so that a missing piece is not taken for correlation.
     """
     residual, weight = _special_residual(formed, _pieces_of(part, len(part.cost)))
     spans = formed.contents.spans
@@ -249,7 +249,7 @@ def _inflation(formed: _Formed, part: Partition) -> float:
 
 
 def _special_residual(formed: _Formed, pieces: tuple[Piece, ...]) -> tuple[FloatArray, ByteArray]:
-    """Return the residual of the segments one after the other, a row of weight 0 in between."""
+    """Return the residuals of the segments in one series, separated by rows of weight 0."""
     series: list[FloatArray] = []
     weights: list[ByteArray] = []
     power = formed.contents.power_mw
@@ -266,7 +266,7 @@ def _no_intervals(pieces: tuple[Piece, ...]) -> tuple[tuple[float, float], ...]:
 
 
 def _source(task: FitTask, rows: np.ndarray) -> FittedData:
-    """Describe the window."""
+    """Return the description of the fitted data."""
     c = task.contents
     return FittedData.of(
         c.time_ns, c.count(SegmentKind.STEADY), c.count(SegmentKind.SLOPE),
@@ -275,11 +275,11 @@ def _source(task: FitTask, rows: np.ndarray) -> FittedData:
 
 
 def _static_residuals(formed: _Formed, pieces: tuple[Piece, ...]) -> ResidualStatistics:
-    """Calibrate on the special segments alone."""
+    """Return the residual statistics of the special segments only."""
     task = formed.task
     rest, weight = _special_residual(formed, pieces)
     rows = rest[weight > 0]
-    # A static curve has no error of its own that is known here: that of its mean is the least.
+    # The error of a static curve is unknown here: use the error of its mean, a lower bound.
     sd = float(np.std(rows))
     return residual_statistics(
         task, rest, weight, task.settings.real('sample_period'), sd, sd / math.sqrt(len(rows))
@@ -287,10 +287,10 @@ def _static_residuals(formed: _Formed, pieces: tuple[Piece, ...]) -> ResidualSta
 
 
 def _only_straight(begun: _Begun, why: str) -> Characteristic:
-    """Return one straight piece where the dynamics could not be estimated.
+    """Return one straight piece if the dynamics could not be estimated.
 
-    Few samples lie in a few clusters, and each cluster's own slope is mostly noise
-    of the valve: pieces of their own would run far off between the clusters.
+    Few samples form a few clusters, and the slope within a cluster is mostly noise
+    of the valve: several pieces would be far wrong between the clusters.
     """
     notes = (f'{NOT_REFINED}one straight piece, without dynamics. {why}',)
     pieces = _pieces_of(begun.part, 1, _inflation(begun.formed, begun.part))
@@ -314,7 +314,7 @@ def _samples(formed: _Formed) -> Samples:
     task, c = formed.task, formed.contents
     step = task.settings.real('sample_period')
     usable = (np.isfinite(c.u) & np.isfinite(c.power_mw)).astype(np.uint8)
-    # A jump in time is a gap even where no row stands in it.
+    # A jump in time is a gap even without rows in it.
     usable[1:][np.diff(c.time_ns) > 1.5e9 * step] = 0
     return Samples(
         u=np.where(usable > 0, c.u, 0.0),
@@ -328,7 +328,7 @@ def _samples(formed: _Formed) -> Samples:
 
 
 def _refinement(begun: _Begun) -> tuple[RegionalModel, int | None]:
-    """Return the curve to begin with, and how many pieces it may get (None: those it has)."""
+    """Return the initial curve and the maximum number of pieces (None: keep its number)."""
     task, static = begun.formed.task, begun.static
     if task.settings.text('selection_rule') != 'prediction_error':
         return static.model, None
@@ -337,7 +337,7 @@ def _refinement(begun: _Begun) -> tuple[RegionalModel, int | None]:
 
 
 def _refined(begun: _Begun, progress: Progress) -> Characteristic:
-    """Refine on all rows; where that is not possible the partition's curve stands, and says so."""
+    """Refine on all rows; if that is impossible return the partition's curve with a note."""
     progress('curve and dynamics together')
     samples = _samples(begun.formed)
     try:

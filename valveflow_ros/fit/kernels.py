@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of curve and regional dynamics, a block of rows at a time.
+"""Residuals of curve and regional dynamics, and their derivatives, in blocks of rows.
 
-As in `answer_residual`; what a row adds to each derivative is written down first, and then every
-row takes up what is left of the row before. While derivatives are formed the sequence of regions
-is taken as it is: letting it flip would turn tangents into spikes.
+`tangents` works like `answer_residual`: first the input of each row to each derivative is
+written, then the recursion over the rows is applied. The sequence of regions is kept fixed in
+the derivatives: a change of region would give spikes in them.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from valveflow_ros.records import ByteArray, FloatArray
 
 # Residuals of curve and regional dynamics over all rows, a block at a time.
 #
-# Within a block all that does not wait for the row before (curve, regions, delayed flows) is done
-# first, for the processor to do side by side; what is left row after row is one product and one
-# sum.
+# Within a block, everything that does not depend on the previous row (curve, regions, delayed
+# flows) is computed first, so that the compiler can vectorise it. The recursion that remains is
+# one product and one sum per row.
 
 _BLOCK = 256
 # The region of a row without data.
@@ -38,7 +38,7 @@ NONE = np.uint8(255)
 @inlined
 def flow_of(u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArray,
             flow: FloatArray) -> None:  # fmt: skip
-    """Write F(u) to ``flow``, both (n,); the outer pieces go on for ever."""
+    """Write F(u) to ``flow``, both (n,); the outer pieces extend to infinity."""
     slope = (right[0] - left[0]) / (knots[1] - knots[0])
     for i in range(u.size):
         flow[i] = left[0] + slope * (u[i] - knots[0])
@@ -46,13 +46,13 @@ def flow_of(u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArra
         begin, low = knots[k], left[k]
         slope = (right[k] - low) / (knots[k + 1] - begin)
         for i in range(u.size):
-            # A choice between two values, unlike one between two ways, is made for many at once.
+            # A choice between two values, in contrast to a branch, can be vectorised.
             flow[i] = low + slope * (u[i] - begin) if u[i] >= begin else flow[i]
 
 
 @inlined
 def scale_flow(flow: FloatArray, scale: FloatArray, offset: float) -> None:
-    """Turn F(u) into the flow in MW, both (n,)."""
+    """Convert F(u) in place into the flow in MW, shape (n,)."""
     for i in range(flow.size):
         flow[i] = scale[i] * flow[i] + offset
 
@@ -61,7 +61,7 @@ def scale_flow(flow: FloatArray, scale: FloatArray, offset: float) -> None:
 def region_of_each(
     flow: FloatArray, usable: ByteArray, levels: FloatArray, region: ByteArray
 ) -> None:
-    """Write the region of each flow, or `NONE` where there is no data; all (n,)."""
+    """Write the region of each flow, or `NONE` without data; all (n,)."""
     region[:] = 0
     for r in range(levels.size):
         for i in range(flow.size):
@@ -72,7 +72,7 @@ def region_of_each(
 
 @inlined
 def _delayed(flow: FloatArray, first: int, count: int, tap: FloatArray, fed: FloatArray) -> None:
-    """Write what ``count`` rows from ``first`` on take from flows before them."""
+    """Write the input to ``count`` rows from ``first`` on from the delayed flows."""
     at = first - int(tap[TAP_WHOLE])
     a, b, c = tap[TAP_0], tap[TAP_1], tap[TAP_2]
     x, y, z = flow[at : at + count], flow[at - 1 : at - 1 + count], flow[at - 2 : at - 2 + count]
@@ -85,9 +85,9 @@ def _feed(
     flow: FloatArray, t: int, region: ByteArray, taps: FloatArray, settle: int, age: int,
     fed: FloatArray, decay: FloatArray, settled: ByteArray,
 ) -> int:  # fmt: skip
-    """Write what each row from ``t`` on takes from the flows and keeps of the state, all (n,).
+    """Write each row's input from the flows and its decay factor, from row ``t`` on; all (n,).
 
-    ``age`` is the number of rows since the last gap; returned is that of the next block.
+    ``age`` is the number of rows since the last gap; the value for the next block is returned.
     """
     i, n = 0, region.size
     while i < n:
@@ -112,7 +112,7 @@ def _feed(
                 + tap[TAP_2] * flow[now - age]
             )
             if age == 0:
-                # In equilibrium, as if the row before had answered with this flow.
+                # Start in steady state, as if the previous answer had been equal to this flow.
                 fed[i] += decay[i] * flow[now]
                 decay[i] = 0.0
             age += 1
@@ -143,22 +143,22 @@ def answer_residual(
     residual: FloatArray,
     weight: ByteArray,
 ) -> None:
-    """Run the model; write what it leaves of the means ``first`` to ``end`` of the power.
+    """Run the model; write the residuals of the means ``first`` to ``end`` of the power.
 
     Parameters
     ----------
     u, scale, usable : (n,)
         The flow is ``scale`` F(u) + ``offset``.
     power, residual, weight : (m,)
-        Means over ``group`` rows. The latter two are written: ``weight`` is 1 where all rows of
-        the mean are usable and settled; elsewhere the residual is 0.
+        Means over ``group`` rows. ``residual`` and ``weight`` are outputs: ``weight`` is 1 if all
+        rows of the mean are usable and settled; otherwise weight and residual are 0.
     knots : (J + 1,); left, right : (J,)
     levels : (I - 1,); taps : (I, 7)
     settle : int
-        Rows after a gap that do not count.
+        Number of rows after a gap that are ignored.
     begin : int
-        The mean at which the filters begin, in equilibrium, so far before ``first`` that this is
-        forgotten; 0 at the head of the data.
+        The mean at which the filters start in steady state, so far before ``first`` that the
+        start has no effect; 0 at the beginning of the data.
     """
     row = begin * group
     flow = np.empty((end - begin) * group)
@@ -195,7 +195,7 @@ def _place_of_each(
     u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArray,
     flow: FloatArray, share: FloatArray, piece: ByteArray,
 ) -> None:  # fmt: skip
-    """Write F(u), how far u is through its piece (0 to 1), and the piece; all (n,)."""
+    """Write F(u), the relative position of u in its piece (0 to 1), and the piece; all (n,)."""
     piece[:] = 0
     width = knots[1] - knots[0]
     for i in range(u.size):
@@ -214,7 +214,7 @@ def _place_of_each(
 
 @inlined
 def _bend(row: FloatArray, k: int, slope: FloatArray, down: float, up: float) -> None:
-    """Add the derivatives of F in piece ``k``, weighed by its two ends.
+    """Add the derivatives of F in piece ``k``, weighted by the parts of its two ends.
 
     Columns: the J + 1 values at the knots, the J - 1 inner knots, the J - 1 jumps.
     A jump at inner knot k lifts the left end of piece k + 1.
@@ -237,10 +237,10 @@ def _fill(
     settle: int, group: int, state: float, age: int,
     answer: FloatArray, settled: ByteArray, decay: FloatArray, table: FloatArray,
 ) -> tuple[float, int]:  # fmt: skip
-    """Run rows from ``t`` on; write what each adds to the derivatives, and keeps of them.
+    """Run the rows from ``t`` on; write each row's input to the derivatives and their decay.
 
-    ``table[i + 1]`` belongs to row i; ``answer`` gets the sums over groups, ``settled`` 0 where a
-    row of the group is not. Returned are the state and the rows since the last gap.
+    ``table[i + 1]`` belongs to row i. ``answer`` receives the sums over groups; ``settled`` is 0
+    if a row of the group is not settled. Return the state and the rows since the last gap.
     """
     regions = taps.shape[0]
     n_curve = table.shape[1] - 2 * regions
@@ -263,7 +263,7 @@ def _fill(
         w0, w1, w2 = tap[TAP_0], tap[TAP_1], tap[TAP_2]
         decay[i] = a
         if age == 0:
-            # In equilibrium the curve's derivatives have been what they are for ever.
+            # In steady state the derivatives of the curve have always been constant.
             state, decay[i] = x0, 0.0
             w0, w1, w2 = w0 / (1.0 - a), w1 / (1.0 - a), w2 / (1.0 - a)
         w0, w1, w2 = w0 * scale[t0], w1 * scale[t1], w2 * scale[t2]
@@ -320,10 +320,10 @@ def tangents(
     knots : (J + 1,); left, right : (J,)
     levels : (I - 1,); time_constants, delays : (I,) seconds
     residual, weight : (end - first,)
-        Written, as there.
+        Outputs, as in `answer_residual`.
     jacobian : (end - first, P)
-        Written, of the answer. P = (J + 1) + (J - 1) + (J - 1) + 2 I: values, knots, jumps, then
-        ln T and tau of each region; where there is one column more it is that of the offset.
+        Output, derivatives of the answer. P = (J + 1) + (J - 1) + (J - 1) + 2 I: values, knots,
+        jumps, then ln T and tau of each region; an additional column is that of the offset.
     """
     slope = (right - left) / (knots[1:] - knots[:-1])
     regions = time_constants.size
@@ -377,8 +377,8 @@ def tangents(
 
 # Normal equations of whitened residuals and tangents, a block of rows at a time.
 #
-# Rows lie one behind the other in memory, so whitening a block of them is, for each coefficient,
-# one long product and sum of two stretches that lie whole rows apart.
+# Rows are contiguous in memory, so whitening a block is, for each coefficient, one long
+# multiply-add of two slices that are a whole number of rows apart.
 
 _NORMAL_BLOCK = 128
 
@@ -387,9 +387,9 @@ _NORMAL_BLOCK = 128
 def _innovations(
     rows: FloatArray, first: int, count: int, width: int, ar: FloatArray, out: FloatArray
 ) -> None:
-    """Write ``count`` rows from ``first`` on, each less what ``ar`` foretells, to ``out``.
+    """Write ``count`` rows from ``first`` on, minus their prediction by ``ar``, to ``out``.
 
-    ``rows`` and ``out`` hold rows of ``width`` numbers one behind the other.
+    ``rows`` and ``out`` contain rows of ``width`` numbers in sequence.
     """
     size, at = count * width, first * width
     now, new = rows[at : at + size], out[:size]
@@ -397,7 +397,7 @@ def _innovations(
         new[i] = now[i]
     k = 0
     while k + 4 <= ar.size:
-        # Four at once: the sum is fetched and put back a quarter as often.
+        # Four coefficients at once need a quarter of the loads and stores of the sum.
         a, b, c, d = ar[k], ar[k + 1], ar[k + 2], ar[k + 3]
         at -= 4 * width
         w = rows[at + 3 * width : at + 3 * width + size]
@@ -417,7 +417,7 @@ def _innovations(
 
 @inlined
 def _whole_before(weight: ByteArray, first: int, order: int) -> int:
-    """Return how many rows before ``first`` follow each other, ``order`` at most."""
+    """Return the number of usable rows directly before ``first``, at most ``order``."""
     run = 0
     while run < order and run < first and weight[first - 1 - run]:
         run += 1
@@ -430,7 +430,7 @@ def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float
     order, end = ar.size, residual.size
     run = _whole_before(weight, min(order, end), order)
     out = np.empty(_NORMAL_BLOCK)
-    # Four sums, so that none of them waits for the one before.
+    # Four independent sums, so that no addition waits for the previous one.
     sums = np.zeros(4)
     for t in range(order, end, _NORMAL_BLOCK):
         n = min(_NORMAL_BLOCK, end - t)
@@ -444,7 +444,7 @@ def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float
 
 @inlined
 def _add_products(table: FloatArray, rows: int, sums: FloatArray) -> None:
-    """Add the products of all columns of ``table``, ``rows`` being a multiple of four."""
+    """Add the products of all columns of ``table``; ``rows`` must be a multiple of four."""
     columns = table.shape[1]
     for i in range(0, rows, 4):
         a, b, c, d = table[i], table[i + 1], table[i + 2], table[i + 3]
@@ -466,23 +466,23 @@ def normal_sums(
     sums: FloatArray,
     scores: FloatArray,
 ) -> int:
-    """Add up the products of whitened tangents and residual; return the rows that count.
+    """Add up the products of whitened tangents and residual; return the number of rows used.
 
     Parameters
     ----------
-    jacobian : (m, P), rows one behind the other; residual, weight : (m,)
+    jacobian : (m, P), rows in sequence; residual, weight : (m,)
     ar : (k,)
     first, end : int
-        The rows whose products are added; what is before them is looked at.
+        The rows whose products are added; the rows before them are read as history.
     sums : (P + 1, P + 1)
-        Written: products of all columns, the residual being the last.
+        Output: products of all columns; the residual is the last one.
     scores : (blocks, P)
-        Added to: whitened tangents times innovation, over even blocks of time of all m rows;
-        there may be none.
+        Increased by whitened tangents times innovation in each of equal blocks of the m rows;
+        may be empty.
 
     Notes
     -----
-    Rows whose history of k rows is not complete are left out, as in `whiten`.
+    Rows without a complete history of k rows are left out, as in `whiten`.
     """
     m, columns = jacobian.shape
     order, blocks = ar.size, scores.shape[0]

@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which form the static power has: P = F(V p^m), or P = p^m F(V) + c.
+"""Choice of the form of the static power: P = F(V p^m), or P = p^m F(V) + c.
 
-Both are fitted to means inside special segments with the same number of knots, and judged on
-stretches of time that were held out, under one whitening. What a ramp adds, the power being late,
-is a column of its own.
+Both are fitted to means inside special segments with the same number of breakpoints, and compared
+on held-out stretches of time with the same whitening. The lag of the power on a ramp is a separate
+column of the regression.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _KNOTS = 10
 _FOLDS, _STRETCHES = 5, 40
 _LEAST_MEANS = 200
 _MOST_MEANS = 6000
-# Each grid runs between the neighbours of the best place of the one before. The likelihood is
-# ragged: a search along its slope would end elsewhere for another unit of the pressure.
+# Each grid covers the neighbourhood of the best value of the previous grid. The likelihood is not
+# smooth: the result of a gradient search would depend on the unit of the pressure.
 _EXPONENT_STEPS = 0.05, 0.01, 0.002
-# Held-out errors count as Student's t with so many degrees of freedom: a stretch beyond what the
-# others visit would otherwise outweigh all of them.
+# Held-out errors are taken as Student's t with these degrees of freedom: otherwise one stretch
+# outside the range of the others would dominate.
 _FREEDOM = 4.0
-# One form is told from the other by so much log-likelihood, so many standard errors of it over
-# stretches, and where the two differ by such a share of the power's range.
+# A form is decided by at least this log-likelihood gain, this many of its standard errors over
+# stretches, and this difference of the two forms as fraction of the power's range.
 _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
-# Another exponent than the one given was searched for, which gains by chance: 15 on the one of 42
-# random plants of the given exponent on which it seemed to be told.
+# A searched exponent gains by chance over the given one: of 42 random plants with the given
+# exponent, one seemed to have another, with a gain of 15.
 _EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
-# Where they are not told apart the likelier one is taken, the paper's in doubt.
+# If undecided, the form over V is used if its gain exceeds this many standard errors.
 _LIKELIER_Z = 1.5
 _CHOKED_EXPONENT = 1.0
 _WORST = 0.05
@@ -49,15 +49,15 @@ _PROFILE_MEANS, _PROFILE_PIECES = 1500, 6
 
 @dataclass(frozen=True, slots=True)
 class FoundForm:
-    """The form that the data ask for.
+    """The form that the data require.
 
     Attributes
     ----------
     form : StaticForm
     offset_mw : float
-        c to begin a fit with; 0 for a form without.
+        Initial c of a fit; 0 for a form without c.
     evidence : FormEvidence or None
-        None where there are too few data to compare a form that was given.
+        None if the data are too few to compare a given form with the other.
     """
 
     form: StaticForm
@@ -69,7 +69,7 @@ class FoundForm:
 class _Means:
     """Means over a minute inside special segments; all (b,).
 
-    ``goes_on`` says that a mean follows the one before without gap.
+    ``goes_on`` is True if a mean follows the previous one without a gap.
     """
 
     opening: FloatArray
@@ -103,29 +103,29 @@ def find_form(
     held: StaticForm | None = None,
     known: StaticForm | None = None,
 ) -> FoundForm | None:
-    """Return the form that the data ask for; None where they are too few to compare forms.
+    """Return the form that the data require; None if they are too few to compare forms.
 
     Parameters
     ----------
     opening, pressure, power : float64 (n,)
-        Rows in %, MPa and MW, NaN where not known.
+        Rows in %, MPa and MW, NaN if unknown.
     spans : int64 (k, 2)
         First and end row of each special segment.
     period_s : float
-        From row to row.
+        Step of the rows.
     exponent : float
-        m of the paper's form unless the data ask for another.
+        m of the paper's form unless the data require another.
     axis : str
-        'auto', or the one to take: 'integrated_input' with the exponent given, or 'opening'.
+        'auto', or a fixed form: 'integrated_input' with the given exponent, or 'opening'.
     held : StaticForm, optional
-        Take this one, and say how it compares with the other.
+        Use this form, and compare it with the other one.
     known : StaticForm, optional
-        What earlier data told of the same valve; it stays unless these tell of another.
+        The form from earlier data of the same valve; it is kept unless the data show another.
 
     Raises
     ------
     DataError
-        The means are too few to find the exponent, or c, of a form that is to be taken.
+        The means are too few to find the exponent or c of the fixed form.
     """
     means = _means_of(opening, pressure, power, spans, period_s)
     if axis == INTEGRATED_INPUT and held is None:
@@ -151,7 +151,7 @@ def find_form(
         held = scaled.form
     gain, sure, told = _told(means, scaled, paper)
     if held is None and not told:
-        # Too little moves the pressure to tell its exponent: that of ideal choked flow will do.
+        # The pressure changes too little to determine its exponent: use that of ideal choked flow.
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
     takes_scaled = gain > _LEAST_GAIN and sure > _LIKELIER_Z
@@ -181,14 +181,14 @@ def find_form(
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """What a curve gets wrong again and again at the same openings and pressures.
+    """The error of a curve that repeats at the same openings and pressures.
 
     Attributes
     ----------
     rms_mw : float
-        Root mean square over what was visited; noise that does not come again is not in it.
+        Root mean square over the visited range, without noise that does not repeat.
     worst : tuple of float
-        Opening in %, pressure in MPa and MW by which the measured power differs there.
+        Opening in %, pressure in MPa, and measured minus predicted power there in MW.
     """
 
     rms_mw: float
@@ -203,19 +203,19 @@ def find_misfit(
     spans: IntArray,
     period_s: float,
 ) -> Misfit | None:
-    """Return what a curve gets wrong, None where that is less than a hundredth of the range.
+    """Return the repeated error of a curve, None if it is below 1 % of the range of the power.
 
     Parameters
     ----------
     opening, pressure, residual, power : float64 (n,)
-        Rows in %, MPa and MW; the residual is measured power less static power of the curve.
+        Rows in %, MPa and MW; the residual is measured power minus static power of the curve.
     spans, period_s
         As for `find_form`.
 
     Notes
     -----
-    Cells of opening and pressure get a mean from even and one from odd eighths of the time. What
-    both have in common is the curve's; the product of independent noise has the mean 0.
+    Each cell of opening and pressure has one mean from even and one from odd eighths of the time.
+    Their product estimates the squared error of the curve, since independent noise has mean 0.
     """
     means = _means_of(opening, pressure, residual, spans, period_s)
     ramp = _means_of(opening, pressure, power, spans, period_s)
@@ -247,13 +247,13 @@ def find_misfit(
 
 
 def _place(x: FloatArray, parts: int) -> IntArray:
-    """Return in which of some equally filled parts each value lies."""
+    """Return the index of the quantile class of each value, of ``parts`` classes."""
     edges = np.quantile(x, np.linspace(0.0, 1.0, parts + 1)[1:-1])
     return np.asarray(np.searchsorted(edges, x, side='right'))
 
 
 def _with_exponent(means: _Means, given: StaticForm) -> _Fit:
-    """Return a form with the exponent given, or another that gains more than chance."""
+    """Return a fit with the given exponent, or with another one that is significantly better."""
     free, fitted = _best(means, given.axis), _fitted(means, given)
     gain, _, told = _told(means, free, fitted, _EXPONENT_APART)
     return free if told and gain > _EXPONENT_GAIN else fitted
@@ -262,7 +262,7 @@ def _with_exponent(means: _Means, given: StaticForm) -> _Fit:
 def _means_of(
     opening: FloatArray, pressure: FloatArray, power: FloatArray, spans: IntArray, period_s: float
 ) -> _Means:
-    """Return means of a minute inside segments, without those that hold a NaN."""
+    """Return one-minute means inside segments, without those that contain a NaN."""
     rows = np.column_stack([opening, pressure, power])
     length = max(1, round(_MEAN_S / period_s))
     parts = []
@@ -279,7 +279,7 @@ def _means_of(
     table[1:, 4] *= known[:-1]
     table = table[known]
     if len(table) > _MOST_MEANS:
-        # Whole runs, so that the whitening finds neighbours.
+        # Keep whole runs, because the whitening needs neighbours.
         run = np.arange(len(table)) // 20
         keep = run % -(-len(table) // _MOST_MEANS) == 0
         table[1:, 4] *= keep[:-1]
@@ -289,7 +289,7 @@ def _means_of(
 
 
 def _best(means: _Means, axis: str) -> _Fit:
-    """Return a form with the exponent that has the least error on stretches held out."""
+    """Return a fit with the exponent that has the smallest error on held-out stretches."""
 
     def cost(exponent: float) -> float:
         return float(_surprise(_fitted(means, StaticForm(axis, exponent)).error).sum())
@@ -303,7 +303,7 @@ def _best(means: _Means, axis: str) -> _Fit:
 
 
 def _fitted(means: _Means, form: StaticForm) -> _Fit:
-    """Return errors on stretches held out, and the fit to all."""
+    """Return the errors on held-out stretches, and the fit to all means."""
     u, scale = form.of_rows(means.opening, means.pressure)
     shape = _hinges(u)
     x = shape if scale is None else np.column_stack([scale[:, None] * shape, np.ones(len(u))])
@@ -337,7 +337,7 @@ def _hinges(x: FloatArray) -> FloatArray:
 
 
 def _surprise(error: FloatArray, scale: float | None = None) -> FloatArray:
-    """Return minus the log-likelihood of each error, its scale being the median of all."""
+    """Return minus the log-likelihood of each error; the default scale is the robust sd of all."""
     s = 1.4826 * float(np.median(np.abs(error))) if scale is None else scale
     s = max(s, 1e-9)
     return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p((error / s) ** 2 / _FREEDOM) + math.log(s))
@@ -346,9 +346,9 @@ def _surprise(error: FloatArray, scale: float | None = None) -> FloatArray:
 def _told(
     means: _Means, one: _Fit, other: _Fit, least_apart: float = _LEAST_APART
 ) -> tuple[float, float, bool]:
-    """Return the log-likelihood that ``one`` gains, its standard errors, and whether that is sure.
+    """Return the log-likelihood gain of ``one``, gain / standard error, and if ``one`` is proven.
 
-    Both errors are whitened alike, by the correlation from mean to mean of the smaller one.
+    Both errors are whitened with the lag-one correlation of the smaller one.
     """
     best = min((one, other), key=lambda fit: float(np.median(np.abs(fit.error))))
     pairs = np.flatnonzero(means.goes_on)
@@ -372,7 +372,7 @@ def _told(
 
 
 def _offset(means: _Means, fit: _Fit) -> float:
-    """Return c of the best partition, searched about that of the hinges.
+    """Return c of the best partition, searched in an interval around c of the hinge fit.
 
     For each c the partition is exact.
     """
@@ -395,6 +395,6 @@ def _offset(means: _Means, fit: _Fit) -> float:
 
 
 def _root(error: FloatArray, without: float = _WORST) -> float:
-    """Return the root mean square without the worst."""
+    """Return the root mean square without the largest errors, a fraction ``without``."""
     least = np.sort(np.abs(error))[: max(1, round((1.0 - without) * len(error)))]
     return float(np.sqrt(np.mean(least**2)))

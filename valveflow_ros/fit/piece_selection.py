@@ -1,14 +1,14 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The number of pieces, judged in the space where the noise is white.
+"""Choice of the number of pieces from the whitened prediction error.
 
-Eq. (24) of the paper looks at the costs of the static fit alone: it cannot
-answer one piece, and one strong knee hides weak ones. With dynamics and an AR
-model of the noise in hand, a further knee can be tested for what it is worth:
-its hinge is sent through the dynamics, whitened, freed of all that the model
-explains already, and held against the innovations. Knees are added while the
-best of them gains enough in log-likelihood after a full refit, and taken away
-while the weakest loses too little.
+Eq. (24) of the paper uses the costs of the static fit only: it cannot return
+one piece, and one strong breakpoint hides weak ones. With dynamics and an AR
+model of the noise, the gain of a further breakpoint can be tested: its hinge
+is filtered by the dynamics, whitened, made orthogonal to the model's tangents,
+and correlated with the innovations. Breakpoints are added while the best one
+gains enough log-likelihood after a full refit. They are removed while the loss
+by removing the weakest one is small.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from valveflow_ros.fit.whitening import whitened
 from valveflow_ros.numerics import gram, product
 from valveflow_ros.records import BoolArray, FloatArray
 
-# Log-likelihood a knee must gain. A knee is two parameters found by a search along u;
+# Required log-likelihood gain of a breakpoint. It has two parameters and is searched along u;
 # by chance the best of such a search gains 3 or 4, once in a thousand about 9.
 KNEE_GAIN = 12.0
-_SURE = 1e3  # worth beyond which nothing changes
-# A unit of log-likelihood is believed by this much only: a knee that the data hardly show may
-# be there all the same. Set on 66 random units of one to four days, of which 81 % came out
-# right; `benchmarks.joint_selection_study` tries it on others.
+_SURE = 1e3  # upper limit of the gain, to avoid overflow
+# Factor of the log-likelihood in the probabilities: a breakpoint may exist although the data
+# hardly show it. Chosen on 66 random units of one to four days, of which 81 % were right;
+# `benchmarks.joint_selection_study` tests it on others.
 _TEMPER = 0.2
 _CANDIDATES = 30
 _BLOCKS = 60
@@ -48,9 +48,8 @@ class Grown:
     ----------
     model : RegionalModel
     worth : dict
-        For each J on the way, from 2 on, the log-likelihood that its J-th piece is worth,
-        with the robust variance; J reaches one beyond the model's pieces where that could
-        be tried.
+        The gain in log-likelihood by the J-th piece, for each J from 2 on, with the robust
+        variance; the largest J is one more than the model's pieces if that was tried.
     """
 
     model: RegionalModel
@@ -58,7 +57,7 @@ class Grown:
 
 
 def _insert(model: RegionalModel, knot: float) -> RegionalModel:
-    """Put a knot onto the curve without changing it."""
+    """Add a knot without changing the curve."""
     k = int(np.clip(np.searchsorted(model.knots, knot) - 1, 0, model.pieces - 1))
     value = float(model.shape(np.array([knot]))[0])
     return replace(
@@ -70,7 +69,7 @@ def _insert(model: RegionalModel, knot: float) -> RegionalModel:
 
 
 def _remove(model: RegionalModel, inner: int) -> RegionalModel:
-    """Take the inner knot number ``inner`` (from 0) out; its pieces become one."""
+    """Remove the inner knot number ``inner`` (from 0); its two pieces become one."""
     return replace(
         model,
         knots=np.delete(model.knots, inner + 1),
@@ -80,7 +79,7 @@ def _remove(model: RegionalModel, inner: int) -> RegionalModel:
 
 
 def _candidates(problem: Problem, model: RegionalModel) -> FloatArray:
-    """Return places for a new knee: quantiles and an even grid, away from knots and ends."""
+    """Return candidate breakpoints: quantiles and a uniform grid, away from knots and ends."""
     u = problem.u[problem.usable > 0]
     spread = np.quantile(u, np.linspace(0.02, 0.98, _CANDIDATES // 2))
     even = np.linspace(spread[0], spread[-1], _CANDIDATES // 2)
@@ -92,7 +91,7 @@ def _candidates(problem: Problem, model: RegionalModel) -> FloatArray:
 
 
 def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[float, float]:
-    """Return the most promising place for a knee and its score gain."""
+    """Return the best position of a further breakpoint and its gain by the score test."""
     places = _candidates(problem, model)
     if not len(places):
         return float('nan'), 0.0
@@ -107,7 +106,7 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
     residual, own, weight = problem.tangents(model)
     own = own[:, free_parameters(model)]
     table = whitened(np.column_stack([own, hinges, residual]), weight, ar)
-    # What the model explains already is taken out of hinges and residual alike.
+    # Remove what the model already explains from the hinges and from the residual.
     n = own.shape[1]
     sums = gram(table)
     scale = np.sqrt(np.maximum(np.diag(sums)[:n], 1e-300))
@@ -120,7 +119,7 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
     total = scores.sum(axis=0) ** 2
     plain = (hinges**2).sum(axis=0) * float((e * e).sum()) / len(e)
     blocks = np.array([part.sum(axis=0) for part in np.array_split(scores, _BLOCKS)])
-    # What the AR model leaves of correlation shows between blocks; the larger variance counts.
+    # Correlation left by the AR model increases the variance of block sums: use the larger one.
     variance = np.maximum(plain, (blocks**2).sum(axis=0) - total / _BLOCKS)
     gain = 0.5 * total / np.maximum(variance, 1e-300)
     best = int(np.argmax(gain))
@@ -128,7 +127,7 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
 
 
 def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: FloatArray) -> float:
-    """Return the log-likelihood that ``large`` gains over ``small``."""
+    """Return the log-likelihood gain of ``large`` over ``small``."""
     residual, weight = problem.answer(large)
     count = len(whitened(residual, weight, ar))
     return float(
@@ -137,7 +136,7 @@ def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: Floa
 
 
 def choose_pieces(problem: Problem, model: RegionalModel, ar: FloatArray, most: int) -> Grown:
-    """Add and remove knees until each is worth its place.
+    """Add and remove breakpoints until each of them gains enough log-likelihood.
 
     Parameters
     ----------
@@ -163,7 +162,7 @@ def choose_pieces(problem: Problem, model: RegionalModel, ar: FloatArray, most: 
 def _grown(
     problem: Problem, model: RegionalModel, ar: FloatArray, most: int, worth: dict[int, float]
 ) -> RegionalModel:
-    """Add the most promising knee while it gains enough."""
+    """Add the best breakpoint while it gains enough log-likelihood."""
     while model.pieces < most:
         place, gain = _best_knee(problem, model, ar)
         worth[model.pieces + 1] = gain
@@ -181,14 +180,14 @@ def _grown(
 def _pruned(
     problem: Problem, model: RegionalModel, ar: FloatArray, worth: dict[int, float]
 ) -> RegionalModel:
-    """Take the weakest knee away while that costs too little."""
+    """Remove the weakest breakpoint while the loss in log-likelihood is below the limit."""
     while model.pieces > 1:
         certainty = bend_certainty(problem, model, ar)
         weakest = int(np.argmin(certainty))
         trial = _remove(model, weakest)
         trial, _ = move(problem, trial, ar, free_parameters(trial), 8)
         least = min(float(certainty[weakest]), _gain(problem, trial, model, ar))
-        # With J pieces each bend was worth at least this: taking more away costs more.
+        # With J pieces each breakpoint gained at least this: removing more of them costs more.
         others = np.sort(np.delete(certainty, weakest))
         for j, value in enumerate([least, *others.tolist()]):
             worth[model.pieces - j] = float(value)
@@ -199,10 +198,10 @@ def _pruned(
 
 
 def _split(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[RegionalModel, float]:
-    """Return the best model with one knee more, put into the middle of a piece, and its worth.
+    """Return the best model with a breakpoint added in the middle of a piece, and its gain.
 
-    One knot may stand for two knees, between them; a further knee then gains nothing where
-    the others stay, and much once they have moved.
+    One fitted breakpoint may stand between two true ones. A further one then gains nothing while
+    the others stay fixed, but much after they have moved.
     """
     best, most = model, -math.inf
     for place in 0.5 * (model.knots[:-1] + model.knots[1:]):
@@ -217,14 +216,14 @@ def _split(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[Regi
 
 
 def confidence(worth: dict[int, float], most: int) -> dict[int, float]:
-    """Return how probable each number of pieces is, from what each piece is worth.
+    """Return the probability of each number of pieces from the gain of each piece.
 
     Parameters
     ----------
     worth : dict
         As in `Grown`.
     most : int
-        Largest number of pieces asked for.
+        Largest number of pieces in the result.
 
     Returns
     -------
@@ -233,9 +232,9 @@ def confidence(worth: dict[int, float], most: int) -> dict[int, float]:
 
     Notes
     -----
-    A piece worth `KNEE_GAIN` makes J and J - 1 equally probable; each unit of
-    log-likelihood beyond it changes the odds by ``exp(_TEMPER)``. Beyond the last piece
-    that was tried a further one is taken for worth as much as that one.
+    If a piece gains `KNEE_GAIN`, J and J - 1 are equally probable; each further unit of
+    log-likelihood multiplies the odds by ``exp(_TEMPER)``. Pieces that were not tried
+    are assumed to gain as much as the last one that was tried.
     """
     last = max(worth, default=1)
     odds = [0.0]
@@ -247,10 +246,10 @@ def confidence(worth: dict[int, float], most: int) -> dict[int, float]:
 
 
 def shifted(likely: dict[int, float], by: int) -> dict[int, float]:
-    """Return probabilities moved to ``by`` more pieces, from 1 on.
+    """Return the probabilities for ``by`` more pieces, restricted to 1 or more and normalised.
 
-    Where two knees turn out to be the ends of one jump, or a piece is split
-    later, all numbers mean one piece more or less than when they were weighed.
+    If two breakpoints are found to be the ends of one jump, or a piece is split
+    later, all numbers of pieces change by one.
     """
     moved = {j + by: share for j, share in likely.items() if j + by >= 1}
     total = sum(moved.values())
@@ -258,7 +257,7 @@ def shifted(likely: dict[int, float], by: int) -> dict[int, float]:
 
 
 def evidence_words(pieces: int, likely: dict[int, float]) -> str:
-    """Say on what evidence the joint fit took its number of pieces."""
+    """Return a sentence on the evidence for the number of pieces."""
     words = (
         f'J = {pieces} was taken by what each breakpoint gains in the whitened prediction error '
         f'of all rows (at least {KNEE_GAIN:g} in log-likelihood)'
@@ -270,16 +269,16 @@ def evidence_words(pieces: int, likely: dict[int, float]) -> str:
     return f'{words}.'
 
 
-# Jumps of the curve: pieces are joined unless the data say otherwise.
+# Jumps of the curve: pieces are joined unless the data require a jump.
 #
-# A continuous curve imitates a jump by a short steep piece. So each short piece is held against a
-# jump in its place, which has one parameter less. Where a jump stands the cost is not smooth in
-# the knot's place, which is therefore searched along a line with both neighbouring lines held.
+# A continuous curve imitates a jump by a short steep piece. So each short piece is compared with a
+# jump at its position, which has one parameter less. The cost is not smooth in the position of a
+# jump, which is therefore found by a line search with both neighbouring lines kept fixed.
 
 _SHORT = 0.06  # of the range of u
 _STEPS = (0.02, 0.01, 0.005, 0.002, 0.001, 0.0005)  # of the range of u
-# A short piece may be this much better in log-likelihood before a jump is refused; its further
-# parameter gains half of one by chance, and the search for the place about one.
+# A jump is refused if the short piece is better by more than this in log-likelihood; by chance
+# its further parameter gains 0.5, and the search for its position about 1.
 _ALLOWANCE = 2.0
 _JUMP_WALD = 20.0
 
@@ -287,7 +286,7 @@ _JUMP_WALD = 20.0
 def find_jumps(
     problem: Problem, model: RegionalModel, ar: FloatArray, cost: float
 ) -> tuple[RegionalModel, BoolArray, float]:
-    """Replace short pieces by jumps where those do as well.
+    """Replace short pieces by jumps if these fit equally well.
 
     Parameters
     ----------
@@ -302,7 +301,7 @@ def find_jumps(
     -------
     model : RegionalModel
     jumps : bool (J - 1,)
-        Which inner knots have one.
+        True for each inner knot with a jump.
     cost : float
     """
     jumps = np.zeros(model.pieces - 1, dtype=bool)
@@ -322,14 +321,14 @@ def find_jumps(
 
 
 def supported_jumps(problem: Problem, model: RegionalModel, ar: FloatArray) -> BoolArray:
-    """Tell which inner knots have a jump that the data ask for, shape (J - 1,)."""
+    """Return True for each inner knot at which the data require a jump, shape (J - 1,)."""
     return np.asarray(_wald(problem, model, ar) > _JUMP_WALD)
 
 
 def _wald(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:
     """Return the Wald statistic of a jump at each inner knot, shape (J - 1,).
 
-    The jump that stands there counts, and what the joint regression would add to it.
+    It tests the jump of the model plus its change by one step of the joint regression.
     """
     sums, rows = problem.normal(model, ar)
     used = np.append(np.diag(sums)[:-1] > 0.0, False)
@@ -344,7 +343,7 @@ def _wald(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:
 
 
 def _collapsed(model: RegionalModel, piece: int) -> RegionalModel:
-    """Take an inner piece out; its neighbours go on to its middle."""
+    """Remove an inner piece; its neighbours are extended to its middle."""
     middle = 0.5 * (model.knots[piece] + model.knots[piece + 1])
     slopes, intercepts = model.slopes(), model.intercepts()
     left, right = np.delete(model.left, piece), np.delete(model.right, piece)
@@ -358,7 +357,7 @@ def _collapsed(model: RegionalModel, piece: int) -> RegionalModel:
 def _settle(
     problem: Problem, model: RegionalModel, jumps: BoolArray, ar: FloatArray, knot: int
 ) -> tuple[RegionalModel, float]:
-    """Alternate between the knot's place and everything else."""
+    """Alternate between the search of the knot's position and the fit of all other parameters."""
     free = free_parameters(model, jumps)
     free[model.pieces + 1 :][: model.pieces - 1][jumps] = False
     cost = problem.cost(model, ar)
@@ -389,7 +388,7 @@ def _search_place(
 
 
 def _moved(model: RegionalModel, knot: int, step: float) -> RegionalModel:
-    """Move an inner knot, the lines on both sides of it held."""
+    """Move an inner knot; the lines on both sides are kept fixed."""
     slopes = model.slopes()
     knots, left, right = model.knots.copy(), model.left.copy(), model.right.copy()
     knots[knot + 1] += step

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measured rows, what a model makes of them, and how its parameters move."""
+"""Measured rows, the residual and tangents of a model, and the fit of its parameters."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from valveflow_ros.fit.kernels import answer_residual, normal_sums, square_sum, 
 from valveflow_ros.numerics import cores, output_size, run_in_threads, runs
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 
-# What reacts to the power within the rows averaged, as a load controller does, would be
-# taken for dynamics of the valve: so in the end few rows are averaged.
+# The last fit averages few rows: a load controller that reacts to the power within the averaged
+# rows would otherwise be taken for dynamics of the valve.
 _FINE_S = 2.0
-# The filters of a stretch of rows begin so many time constants before it: what they began with is
-# then less than the last bit of the answer.
+# The filters of a stretch of rows start this many time constants before it: their initial state
+# then has no effect on the last bit of the answer.
 _FORGOTTEN = 40.0
-# A stretch has this many means at least, and eight times what comes before it. How the rows are
-# cut depends on them and the model alone, so that the bits do not depend on the machine.
+# Minimum number of means of a stretch; it also has at least eight times its lead. The division
+# depends on rows and model only, so that the result does not depend on the machine.
 _STRETCH = 8192
 _FEW = 4
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
@@ -32,16 +32,16 @@ _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """All rows of the window, as the model needs them.
+    """All rows of the window, in the form that the model needs.
 
     Attributes
     ----------
     u, power_mw : float64 (n,)
     usable : uint8 (n,)
-        0 where a row has no data; a gap restarts the filters.
+        0 if a row has no data; a gap restarts the filters.
     step_s : float
     settle_s : float
-        Rows this long after a gap are not scored.
+        Rows within this time after a gap are not scored.
     group : int
         Rows averaged before scoring.
     scale : float64 (n,), optional
@@ -63,7 +63,7 @@ class Samples:
 
     @property
     def scale_or_ones(self) -> FloatArray:
-        """Return p^e, 1 for a form without."""
+        """Return p^e, or ones for a form without p^e."""
         return np.ones(len(self.u)) if self.scale is None else self.scale
 
     def with_scale_power(self, power: float) -> Samples:
@@ -72,14 +72,14 @@ class Samples:
         return self if scale is None else replace(self, scale=scale)
 
     def finer(self) -> Samples:
-        """Return the same rows with hardly any averaging, for the last word on all parameters."""
+        """Return the same rows with little averaging, for the last fit of all parameters."""
         return replace(self, group=max(1, min(self.group, round(_FINE_S / self.step_s))))
 
     def coarser(self) -> Samples:
-        """Return means over some rows, for searches: two rows to a scored mean.
+        """Return means over several rows, for searches; a scored mean then has two rows.
 
-        The filter is exact for a flow that is straight between rows, so little is
-        lost but what is faster than the rows.
+        The filter is exact for a flow that is linear between rows, so only changes
+        that are faster than the rows are lost.
         """
         factor = self.group // 2
         if factor < 2:
@@ -102,7 +102,7 @@ class Samples:
 
 
 class Problem:
-    """Measured means, and what a model makes of them."""
+    """Measured means, and residuals and tangents of a model for them."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
@@ -131,7 +131,7 @@ class Problem:
                 begin, first, end, residual, weight,
             )  # fmt: skip
 
-        # An answer takes so little that more and shorter stretches would cost more than they gain.
+        # The answer is fast to compute: more and shorter stretches would be slower.
         run_in_threads(stretch, self._stretches(model, least=-(-s.means // _FEW)), self._threads)
         return residual, weight
 
@@ -140,7 +140,7 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray, ByteArray]:
         """Return residual (m,), Jacobian of the prediction (m, P) and weight (m,).
 
-        There is room for some columns more behind the others, ``also``, not yet written.
+        The Jacobian has ``also`` further columns at the end, which are not initialised.
         """
         s = self.samples
         residual = np.empty(s.means)
@@ -157,7 +157,7 @@ class Problem:
         return residual, jacobian, weight
 
     def normal(self, model: RegionalModel, ar: FloatArray) -> tuple[FloatArray, int]:
-        """Return `normal_equations` of the tangents, which are never all in memory at once.
+        """Return `normal_equations` of the tangents without storing all tangents in memory.
 
         Returns
         -------
@@ -204,9 +204,9 @@ class Problem:
     def _stretches(
         self, model: RegionalModel, also: int = 0, least: int = 0
     ) -> list[tuple[int, int, int]]:
-        """Cut the means into stretches: where the filters begin, the first that counts, the end.
+        """Divide the means into stretches: start of the filters, first mean to use, end.
 
-        So many means before the first are to be right, ``also``; a stretch has ``least`` means.
+        ``also`` means before the first are correct, too; a stretch has at least ``least`` means.
         """
         s = self.samples
         memory_s = _FORGOTTEN * float(model.time_constants.max()) + float(model.delays.max())
@@ -223,7 +223,7 @@ def free_parameters(model: RegionalModel, jumps: BoolArray | None = None) -> Boo
 
 
 def in_bounds(model: RegionalModel, samples: Samples) -> bool:
-    """Tell whether a model is one a plant can have and a filter can run."""
+    """Return True if a model is physically possible and the filter can run it."""
     span = model.knots[-1] - model.knots[0]
     return bool(
         np.all(np.diff(model.knots) > 0.004 * span)
@@ -237,7 +237,7 @@ def in_bounds(model: RegionalModel, samples: Samples) -> bool:
 def move(
     problem: Problem, model: RegionalModel, ar: FloatArray, free: BoolArray, steps: int
 ) -> tuple[RegionalModel, float]:
-    """Lower the cost in the free parameters, levels held."""
+    """Minimise the cost over the free parameters; the levels are kept fixed."""
 
     def equations(model: RegionalModel) -> tuple[FloatArray, FloatArray]:
         sums, _ = problem.normal(model, ar)
@@ -256,7 +256,7 @@ def move(
 def with_level_moved(
     model: RegionalModel, level: int, by: float, least: float = 1.0
 ) -> RegionalModel | None:
-    """Return the model with one level moved; None if two come closer than ``least`` MW."""
+    """Return the model with one level moved; None if two levels are within ``least`` MW."""
     levels = model.levels.copy()
     levels[level] += by
     return None if np.any(np.diff(levels) <= least) else model.with_levels(levels)
@@ -265,7 +265,7 @@ def with_level_moved(
 def search_levels(
     problem: Problem, model: RegionalModel, ar: FloatArray, cost: float
 ) -> tuple[RegionalModel, float]:
-    """Move each level along a line, the step shrinking, while the cost falls."""
+    """Move each level in decreasing steps while the cost falls."""
     for k in range(len(model.levels)):
         for step, sign in itertools.product(_LEVEL_STEPS_MW, (1.0, -1.0)):
             model, cost = descend(

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine curve, time constants, delays and regions together on all samples.
 
-The special segments give F up to a term that eq. (14) of the paper drops:
+The special segments give F up to a term that eq. (14) of the paper neglects:
 on a ramp the power lags by ``K_f eta_1 (T + tau)``, several MW. So F from the
-exact partition is the start, and curve and regional dynamics are then fitted
+exact partition is the start. Curve and regional dynamics are then fitted
 together by the prediction error on all samples, whitened by an AR model of
-the residual (the noise of the power is far from white). The regions are found
-first on a grid; their boundary is searched along a line, since the cost is
-not smooth in it; everything else moves by Levenberg-Marquardt.
+the residual (the noise of the power is far from white). The regions are first
+found on a grid. Their boundaries are found by line searches, since the cost is
+not smooth in them; all other parameters by Levenberg-Marquardt.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from valveflow_ros.fit.whitening import ORDER, fit_ar, whitened
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 from valveflow_ros.signals.static_form import EXPONENTS
 
-# Errors of the measured input, which make a plant look slower than it is, and their correction.
+# Correction of the errors of the measured input, which make the plant seem too slow.
 #
-# Least squares take opening and pressure for exact. Their sensors' noise goes through the model
-# and not through the plant, so a fit prefers a model that lets less of it pass: time constants
-# come out a few per cent too long. Simulation and extrapolation (Cook and Stefanski, J. Am. Stat.
-# Assoc. 89, 1994) takes that back: noise of the same size is added once more, the fit moves by the
-# bias that once more of it causes, and is moved back by as much.
+# Least squares assumes that opening and pressure are exact. The noise of their sensors passes
+# through the model but not through the plant, so the fit prefers a model that damps it: time
+# constants become a few per cent too long. Simulation and extrapolation (Cook and Stefanski,
+# J. Am. Stat. Assoc. 89, 1994) removes this bias: noise of the same size is added again, the fit
+# changes by the bias that this noise causes, and this change is subtracted from the first fit.
 
 _SEED = 20240229
 _LEAST_PAIRS = 1000
-_LEAST_DOUBLING = 0.85  # of what the movement should grow by from two rows to four
+_LEAST_DOUBLING = 0.85  # fraction of the expected growth of the movement from two rows to four
 _MEDIAN_TO_SD = 0.6744897501960817
 
 
 def relative_noise(u: FloatArray, usable: ByteArray) -> float:
-    """Return the sd of the noise of ``u`` from row to row, as a share of ``u``.
+    """Return the sd of the white noise of ``u``, as a fraction of ``u``.
 
-    A second difference of values one row apart holds the noise and what a wandering valve moves
-    in one row; of values two rows apart the same noise and twice the movement. Their
-    extrapolation to no row at all is the noise alone. Straight ramps vanish in both, medians
-    keep leaps out; too few rows, no noise, or rows too slow to tell, give 0.
+    A second difference of values one row apart contains the noise and the random movement of the
+    valve in one row; of values two rows apart, the same noise and twice the variance of movement.
+    Extrapolation to zero rows gives the noise only. Straight ramps cancel in both; medians
+    suppress jumps. Too few rows, no noise, or rows slower than the valve give 0.
     """
     run = usable > 0
     if len(u) < _LEAST_PAIRS:
@@ -74,9 +74,9 @@ def relative_noise(u: FloatArray, usable: ByteArray) -> float:
     known = np.isfinite(bends[0]) & np.isfinite(bends[1]) & np.isfinite(bends[2])
     if known.sum() < _LEAST_PAIRS:
         return 0.0
-    # The median of |x| is 0.6745 sd; the noise enters a second difference six times.
+    # The median of |x| is 0.6745 sd; a second difference has six times the noise variance.
     one, two, four = ((np.median(np.abs(d[known])) / _MEDIAN_TO_SD) ** 2 for d in bends)
-    # Where rows are slow against the valve, movement no longer doubles and would pass for noise.
+    # If rows are slower than the valve, the movement does not double and would look like noise.
     if two - one > 0.1 * one and four - two < _LEAST_DOUBLING * 2.0 * (two - one):
         return 0.0
     return float(np.sqrt(max(0.0, (2.0 * one - two) / 6.0)))
@@ -85,9 +85,9 @@ def relative_noise(u: FloatArray, usable: ByteArray) -> float:
 def corrected(
     samples: Samples, problem: Problem, model: RegionalModel, ar: FloatArray, free: BoolArray
 ) -> RegionalModel:
-    """Take the bias back that errors of the input cause; ``model`` has converged on ``problem``.
+    """Remove the bias due to errors of the input; ``model`` has converged on ``problem``.
 
-    The extrapolation is linear. Where it would leave what a plant can have, the model stays.
+    The extrapolation is linear. If its result is out of bounds, the model is returned unchanged.
     """
     r = np.random.default_rng(_SEED)
 
@@ -110,23 +110,23 @@ def corrected(
     return trial if in_bounds(trial, problem.samples) else model
 
 
-# Find the regions of different dynamics: how many, where, and roughly which.
+# Find the regions of different dynamics: number, boundaries, and approximate values.
 
 _GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 _GRID_DELAY_S = (0.0, 4.0, 12.0, 30.0)
 _MAX_REGIONS = 3
 _CELLS = 60
 _LEAST_CELLS = 4
-# A further region (T, tau, level) must gain this in log-likelihood; three
-# parameters of pure chance gain about 1.5, and the search over levels a few more.
+# Required log-likelihood gain of a further region (T, tau, level); by chance three
+# parameters gain about 1.5, and the search over levels a few more.
 _REGION_GAIN = 15.0
 
 
 def _first_regions(problem: Problem, model: RegionalModel) -> list[RegionalModel]:
-    """Return a start for each number of regions, from a grid of (T, tau).
+    """Return an initial model for each number of regions, from a grid of (T, tau).
 
-    Each pair is run over everything; then levels are chosen so that the sum of
-    squares is least when each stretch of flow takes its own best pair. The
+    Each pair is simulated over all rows. Then levels are chosen such that the sum
+    of squares is minimal if each range of flow has its own best pair. The
     filter's memory across a level is neglected here.
     """
     pairs = [(t, d) for t in _GRID_T_S for d in _GRID_DELAY_S if d <= t]
@@ -160,7 +160,7 @@ def _first_regions(problem: Problem, model: RegionalModel) -> list[RegionalModel
 
 
 def _best_cuts(sums: FloatArray, regions: int, least: int) -> list[int]:
-    """Cut the cells into ``regions`` stretches, each with its best pair; least cost."""
+    """Divide the cells into ``regions`` ranges, each with its best pair, at minimal cost."""
     cells = sums.shape[1] - 1
     cost = np.full((regions + 1, cells + 1), np.inf)
     back = np.zeros((regions + 1, cells + 1), dtype=np.int64)
@@ -181,7 +181,7 @@ def _best_cuts(sums: FloatArray, regions: int, least: int) -> list[int]:
 def _settle_down(
     problem: Problem, model: RegionalModel, free: BoolArray, rounds: int
 ) -> tuple[RegionalModel, float, FloatArray]:
-    """Alternate between parameters, levels and whitening."""
+    """Alternate between the fit of parameters, of levels, and of the AR model."""
     ar = np.zeros(ORDER)
     cost = np.inf
     for round_ in range(rounds):
@@ -194,7 +194,7 @@ def _settle_down(
 
 
 def _thinnest(problem: Problem, model: RegionalModel) -> float:
-    """Return the least share of rows that a region has."""
+    """Return the fraction of rows in the smallest region."""
     used = problem.usable > 0
     flow = model.static(problem.u[used], problem.scale[used])
     region = np.searchsorted(model.levels, flow, side='right')
@@ -215,7 +215,7 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
         free = free_parameters(candidate)
         trial, _, ar = _settle_down(problem, candidate, free, rounds=3)
         if best is not None:
-            # Judged under one whitening, that of the larger model.
+            # Both are compared with the whitening of the larger model.
             small, large = problem.cost(best[0], ar), problem.cost(trial, ar)
             residual, weight = problem.answer(trial)
             count = len(whitened(residual, weight, ar))
@@ -229,31 +229,31 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
 
 
 _LEAST_ROWS, _LEAST_S = 600, 3600.0
-# What an autoregressive model must remember: white noise on top of slow noise has a long tail.
+# Memory of the AR model: the sum of white and slow noise needs many coefficients.
 _MEMORY_S = 40.0
 _POWER_STEP, _POWER_ROUNDS = 0.01, 4
-_NARROWEST = 0.01  # of the range of u: narrower pieces are not given to the search
+_NARROWEST = 0.01  # of the range of u: narrower pieces are joined before the search
 
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """The outcome.
+    """The result of a refinement.
 
     Attributes
     ----------
     model : RegionalModel
     covariance : float64 (P, P)
-        Of the packed parameters, robust against what the AR model leaves (block scores).
+        Of the packed parameters; block scores allow for correlation that the AR model leaves.
     level_stderr : float64 (I - 1,)
         Of the levels between regions, MW.
     free : bool (P,)
-        Which packed parameters were free; jumps not supported by the data are not.
+        True for the free packed parameters; jumps not supported by the data are not free.
     ar : float64 (k,)
         Of the residual of the last fit, whose rows are means over 2 s (or single rows).
     innovation_mw : float
-        sd of that residual when whitened.
+        sd of that residual after whitening.
     prediction_mw : float
-        How wrong the prediction is because parameters are, root mean square.
+        Error of the prediction due to the errors of the parameters, root mean square.
     residual_mw : float64 (m,), weight : uint8 (m,)
         Residual of the means and whether it was scored.
     row_sd_mw : float
@@ -261,7 +261,7 @@ class Refined:
     confidence : dict
         Probability of each number of pieces; empty when it was given.
     scale_power : float
-        To which power p^e was raised.
+        The power to which p^e was raised.
     """
 
     model: RegionalModel
@@ -291,18 +291,18 @@ def refine(
     start : RegionalModel
         The curve of the exact partition; its dynamics are not used.
     most_pieces : int, optional
-        Choose the number of pieces too, up to this many; without it ``start``'s number stays,
-        but for pieces narrower than a hundredth of the range, which are joined with others.
-        ``start`` should then have rather too many pieces than too few: the AR model takes the
-        misfit of a curve that is too simple for noise.
+        Choose also the number of pieces, up to this maximum. ``start`` should then have too many
+        pieces rather than too few: the AR model takes the misfit of a too simple curve for noise.
+        By default the number of ``start`` is kept, except that pieces narrower than a hundredth
+        of the range are joined with others.
     exponent : float, optional
-        e of p^e where it is free: p^e is raised to the power that fits best,
+        e of p^e if e is free: p^e is raised to the power that fits best,
         `Refined.scale_power`.
 
     Raises
     ------
     TooFewSamplesError
-        Too few rows lie far enough behind a gap.
+        Too few rows are far enough after a gap.
 
     Returns
     -------
@@ -339,14 +339,14 @@ def search(
     most_pieces: int | None,
     exponent: float | None = None,
 ) -> tuple[RegionalModel, float]:
-    """Find regions and pieces on means of ten seconds: `refine` without its last fit.
+    """Find regions and pieces on averaged rows: `refine` without its last fit.
 
-    Returns the model, and the power of p^e that fits best.
+    Return the model, and the power of p^e that fits best.
 
     Raises
     ------
     TooFewSamplesError
-        As for `refine`.
+        As in `refine`.
     """
     model, _, power = _outlined(samples, start, most_pieces, exponent)
     return model, power
@@ -374,14 +374,14 @@ def _outlined(
 def _with_exponent(
     coarse: Samples, model: RegionalModel, likely: dict[int, float], exponent: float
 ) -> tuple[RegionalModel, dict[int, float], float]:
-    """Return a model with the power of p^e that fits best, all else fitted along with it."""
+    """Return a model with the power of p^e that fits best; all other parameters are refitted."""
     free = free_parameters(model)
     residual, weight = Problem(coarse).answer(model)
     ar = fit_ar(residual, weight)
 
     def fitted(power: float) -> tuple[float, RegionalModel]:
         problem = Problem(coarse.with_scale_power(power))
-        # What F is multiplied by at the median pressure stays as it is.
+        # The factor of F at the median pressure is kept constant.
         middle = float(np.median(coarse.scale_or_ones[coarse.usable > 0])) ** (1.0 - power)
         begin = replace(model, left=middle * model.left, right=middle * model.right)
         moved, cost = move(problem, begin, ar, free, 3)
@@ -401,14 +401,14 @@ def _with_exponent(
 
 
 def least_rows(step_s: float) -> int:
-    """Return how many rows of a step a refinement needs: an hour, and not too few numbers."""
+    """Return the number of rows that a refinement needs: one hour, and at least `_LEAST_ROWS`."""
     return max(_LEAST_ROWS, round(_LEAST_S / step_s))
 
 
 def _search(
     problem: Problem, start: RegionalModel, most_pieces: int | None
 ) -> tuple[RegionalModel, dict[int, float]]:
-    """Find regions and, if asked, the number of pieces; and how probable each number is."""
+    """Find regions and, on request, the number of pieces with the probability of each number."""
     model, ar = find_regions(problem, start)
     if most_pieces is None:
         return model, {}
@@ -417,10 +417,10 @@ def _search(
 
 
 def _join(model: RegionalModel) -> RegionalModel:
-    """Close the jumps of a curve, and take out knots too close to others to be moved.
+    """Close the jumps of a curve, and remove knots that are too close to others to be moved.
 
-    At each inner knot both ends take their mean. The exact partition may put a
-    break round a handful of samples.
+    At each inner knot both ends take their mean. The exact partition may make a
+    piece of very few samples.
     """
     values = np.concatenate(
         [model.left[:1], 0.5 * (model.right[:-1] + model.left[1:]), model.right[-1:]]
@@ -439,7 +439,7 @@ def _join(model: RegionalModel) -> RegionalModel:
 def _conclude(
     problem: Problem, fine: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray
 ) -> Refined:
-    """Add what is left over, and how sure the parameters are."""
+    """Add the residual and the uncertainty of the parameters."""
     certainty = covariance_of(fine, model, free, ar)
     residual, weight = problem.answer(model)
     return Refined(
@@ -449,6 +449,6 @@ def _conclude(
 
 
 def _row_sd(problem: Problem, model: RegionalModel) -> float:
-    """Return the sd of single rows about the model, MW."""
+    """Return the sd of the residual of single rows, MW."""
     residual, weight = Problem(replace(problem.samples, group=1)).answer(model)
     return float(np.std(residual[weight > 0]))

@@ -1,13 +1,13 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A chart that watches the residual for a lasting shift: whitened block means, two-sided CUSUMs.
+"""Control chart for a lasting shift of the residual: whitened block means, two-sided CUSUMs.
 
-The residual is averaged over blocks of a minute, which takes the fast noise out; what is left is
-correlated from block to block, and a chart with limits for independent values would cry wolf
-eighty times as often as it says. So each block is whitened by the autocorrelation that the curve's
-own clean residual had. Two cumulative sums (Page, Biometrika 41, 1954) watch each side: one for
-small shifts that last, one for large ones that must be seen within minutes. Their limits come with
-the curve (`run_length`): they belong to a wanted time between false alarms.
+The residual is averaged over blocks of a minute, which removes the fast noise. The block means are
+correlated, and limits for independent values would give eighty times as many false alarms as
+intended. So each block is whitened by the autocorrelation of the curve's own clean residual. Two
+cumulative sums (Page, Biometrika 41, 1954) monitor each side: one for small lasting shifts, one
+for large shifts that must be detected within minutes. Their limits are stored with the curve and
+follow from the required time between false alarms (`design_chart`).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
 from valveflow_ros.state import Memory
 
-# One wild block cannot raise the alarm alone.
+# A single outlier block cannot raise the alarm.
 _CLIP = 4.0
-# A sum that grew for hours would take hours to come down again.
+# Upper bound of a sum, in limits: without it a sum that grew for hours would need hours to fall.
 _CEILING = 1.25
 _BLOCK, _GOOD = range(2)
 _SUM, _LAST, _EVIDENCE, _SHIFT = range(4)
-# For each of four sums: its value, the residuals added since it left zero, and how many.
+# For each of four sums: its value, and the sum and number of residuals since it left zero.
 _C, _TOTAL, _COUNT = range(3)
 SMALL, LARGE = 0, 1
 
 
 @jit
 def innovation(mean: float, before: float, correlation: float, sd: float) -> float:
-    """Return the whitened block mean, clipped; ``before`` is NaN behind a gap."""
+    """Return the whitened block mean, clipped; ``before`` is NaN after a gap."""
     if math.isnan(before):
         e = mean * math.sqrt(1.0 - correlation * correlation) / sd
     else:
@@ -44,7 +44,7 @@ def innovation(mean: float, before: float, correlation: float, sd: float) -> flo
 
 @jit
 def add(sums: FloatArray, e: float, mean: float, slack: FloatArray, limit: FloatArray) -> None:
-    """Add one block to the four sums (4, 3): up and down for small, then for large shifts."""
+    """Add one block to the four sums (4, 3): up and down for small shifts, then for large ones."""
     for k in range(4):
         which = k // 2
         sign = 1.0 if k % 2 == 0 else -1.0
@@ -59,7 +59,7 @@ def add(sums: FloatArray, e: float, mean: float, slack: FloatArray, limit: Float
 
 @jit
 def _judge(sums: FloatArray, limit: FloatArray, state: FloatArray) -> None:
-    """Write the strongest evidence, signed, and the shift it speaks of."""
+    """Write the signed evidence of the strongest sum, and its shift."""
     state[_EVIDENCE] = 0.0
     state[_SHIFT] = 0.0
     for k in range(4):
@@ -85,7 +85,7 @@ def _run(
     evidence: FloatArray,
     shift: FloatArray,
 ) -> None:
-    """Run rows through the chart; a block is judged by the first row behind it."""
+    """Add rows to the chart; a block is evaluated at the first row after it."""
     for t in range(residual.size):
         block = time_ns[t] // block_ns
         if block != place[_BLOCK]:
@@ -108,13 +108,13 @@ def _run(
 
 
 class ResidualChart(Memory):
-    """Watch the residual of one curve, in constant time a row.
+    """Monitor the residual of one curve, in constant time per row.
 
     Parameters
     ----------
     design : ChartDesign
     step_s : float
-        Step of the rows. Blocks with less than half their rows are not judged.
+        Step of the rows. Blocks with less than half of their rows are ignored.
     """
 
     REMEMBERED = ('_place', '_state', '_sums')
@@ -130,9 +130,9 @@ class ResidualChart(Memory):
         self._sums = np.zeros((4, 3))
 
     def follow(self, other: ResidualChart) -> None:
-        """Go on where the chart of an earlier curve was: a new curve undoes no evidence.
+        """Continue the chart of an earlier curve: a new curve does not remove evidence.
 
-        The sums keep their shares of the limits. With another length of blocks it starts afresh.
+        Each sum keeps its ratio to the limit. If the block length differs, nothing is copied.
         """
         if other._block_ns != self._block_ns:
             return
@@ -142,19 +142,19 @@ class ResidualChart(Memory):
         self._sums[:, _C] *= np.repeat(self._limit / other._limit, 2)
 
     def feed(self, time_ns: IntArray, residual_mw: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the evidence and the shift it speaks of after each row, shapes (n,).
+        """Return the evidence and the corresponding shift after each row, shapes (n,).
 
         Parameters
         ----------
         time_ns : int64 (n,)
         residual_mw : float64 (n,)
-            NaN where there is nothing to judge.
+            NaN without a residual.
 
         Returns
         -------
         evidence : float64 (n,)
-            Share of the limit that the strongest sum has reached, positive where the plant gives
-            more than expected: beyond 1 or -1 there is an alarm. NaN before the first block.
+            Ratio of the strongest sum to its limit, positive if the plant gives more than
+            expected; above 1 or below -1 there is an alarm. NaN before the first block.
         shift_mw : float64 (n,)
             Mean residual since that sum left zero.
         """
@@ -167,39 +167,39 @@ class ResidualChart(Memory):
         return evidence, shift
 
 
-# Limits of the residual's chart for a wanted time between false alarms.
+# Limits of the residual chart for a required time between false alarms.
 #
-# Tables of limits hold for independent normal values. The unit's own clean residual is neither
-# quite independent after whitening nor normal, so its blocks are drawn again and again in runs of
-# an hour (moving-block bootstrap, Kuensch, Ann. Stat. 17, 1989), and the limits are put where the
-# chart then gives one alarm in the wanted time. What a short window cannot show is guarded
-# against: the limits are never below those for independent normal values, and the slack holds the
+# Tables of limits are valid for independent normal values. The unit's own clean residual is not
+# exactly independent after whitening, and not normal. So its blocks are resampled in runs of an
+# hour (moving-block bootstrap, Kuensch, Ann. Stat. 17, 1989), and the limits are chosen such that
+# the chart then gives one alarm in the required time. A short window does not show everything:
+# the limits are never below those for independent normal values, and the slack includes the
 # curve's own error.
 
 _SEED = 19540301
 _RUN = 60  # blocks drawn together
-_ALARMS = 35  # that the drawn record should hold
+_ALARMS = 35  # that the resampled record should contain
 _LARGEST_CORRELATION = 0.995
 _MAD_TO_SD = 1.4826022185056018
 _SLACK_SMALL, _SLACK_LARGE = 0.25, 1.0
 _DAY_S = 86400.0
-# Correlation and spread come from days of data: without some to spare, residuals drawn anew gave
-# an alarm in 25 to 28 days where 30 were wanted (`benchmarks.alarm_run_length`).
+# Margin, because correlation and spread are estimated from few days: without it, new residuals
+# gave one alarm in 25 to 28 days instead of 30 (`benchmarks.alarm_run_length`).
 _SPARE = 1.4
-# A young curve has not seen all of its unit: where that comes first, it is off for a quarter
-# of an hour. How often that raises an alarm is counted by `benchmarks.young_curves`.
+# A curve from few data has not seen all operation of its unit; where it first meets new operation,
+# it is wrong for a quarter of an hour. `benchmarks.young_curves` counts the resulting alarms.
 _YOUNG_DAYS = 0.4
 _HIGHEST = 400.0
 _LEAST_LIMIT = 4.5  # more than one clipped block can add
-# Weather, cooling water and fouling move the output by megawatts over days, and a window of days
-# shows little of that. It shows how far the residual goes in six hours, from which the level goes
-# on; how often healthy units alarm with this factor is counted by `benchmarks.monitor_study`.
+# Weather, cooling water and fouling change the output by megawatts over days, and a window of days
+# shows little of that. So the spread over days is extrapolated from the changes within six hours;
+# `benchmarks.monitor_study` counts the alarms of healthy units with this factor.
 _WANDER_S = 21_600.0
 _TO_DAYS = 1.5
-# Until six hours have passed some times, half of what need not be found is taken for it.
+# Weight of the prior value, half of the smallest shift to be found, in six-hour blocks.
 _PRIOR_BLOCKS = 4.0
-_LARGEST_MOVE = 2.5  # usual ones; beyond lies a fault
-# A unit may be so many spreads of its days away from the curve, and nothing is wrong.
+_LARGEST_MOVE = 2.5  # in usual changes; a larger one is a fault
+# A healthy unit may differ from the curve by this many times its spread over days.
 _WANDERS = 4.0
 
 
@@ -214,42 +214,42 @@ def design_chart(
     curve_error_mw: float,
     wander_mw: float = 0.0,
 ) -> ChartDesign:
-    """Return the chart for a curve whose clean residual is given.
+    """Return the chart for a curve from its clean residual.
 
     Parameters
     ----------
     residual_mw : float64 (n,)
-        Of rows (or means of some) one after the other, on the data the curve was fitted to.
+        Consecutive rows, or means of rows, of the data to which the curve was fitted.
     weight : uint8 (n,)
-        0 where it does not count.
+        0 for rows that are not used.
     step_s : float
-        Between those rows.
+        Step of those rows.
     block_s : float
     run_length_days : float
-        Wanted mean time between false alarms.
+        Required mean time between false alarms.
     floor_mw : float
         Shifts below this need not be found.
     curve_error_mw : float
-        How wrong the curve may be where it was fitted (standard error).
+        Standard error of the curve in the range of its data.
     wander_mw : float
-        sd of the slow wander of the residual about this curve, see `slow_wander`.
+        sd of the slow random variation of the residual of this curve, see `slow_wander`.
     """
     block_s = max(block_s, step_s)
     rows = max(1, round(block_s / step_s))
     block_s = rows * step_s
     means = block_means(residual_mw, weight, rows)
     correlation, sd = _correlation(means)
-    seen = 1.0 - correlation  # share of a lasting shift that is left in an innovation
-    # On a quiet unit what need not be found is many innovations wide, and innovations are
-    # clipped: the slack would swallow every shift. There the width is that of what may pass.
+    seen = 1.0 - correlation  # fraction of a lasting shift that remains in an innovation
+    # On a unit with little noise the allowed shift is many sd of the innovations, and innovations
+    # are clipped: the slack would exceed every shift. There the sd is that of the allowed shift.
     passes_mw = math.hypot(2.0 * curve_error_mw, _WANDERS * wander_mw)
     sd = max(sd, (0.5 * floor_mw + passes_mw) * seen)
-    # Where the curve is wrong by two of its standard errors, or the unit is off as it is by
-    # weather, that alone must not raise an alarm.
+    # A curve that is wrong by two of its standard errors, or a usual effect of the weather on the
+    # unit, must not raise an alarm.
     error = passes_mw * seen / sd
     small = max(_SLACK_SMALL, 0.5 * floor_mw * seen / sd) + error
     slack = (small, max(_SLACK_LARGE + error, small))
-    # Each of the two charts may give half of the false alarms.
+    # Each of the two sums may give half of the false alarms.
     blocks = 2.0 * _SPARE * run_length_days * _DAY_S / block_s
     e = _innovations(means, correlation, sd)
     drawn = _drawn(e, int(min(_ALARMS * blocks, 4_000_000)))
@@ -265,16 +265,16 @@ def design_chart(
 def slow_wander(
     residual_mw: FloatArray, weight: ByteArray, step_s: float, floor_mw: float
 ) -> float:
-    """Return the sd with which the level of the residual wanders from day to day, MW.
+    """Return the sd of the random variation of the residual's level from day to day, MW.
 
     Parameters
     ----------
     residual_mw : float64 (n,)
-        Of rows (or means of some) one after the other, on the data the curve was fitted to.
+        Consecutive rows, or means of rows, of the data to which the curve was fitted.
     weight : uint8 (n,)
-        0 where it does not count.
+        0 for rows that are not used.
     step_s : float
-        Between those rows.
+        Step of those rows.
     floor_mw : float
         Lasting shifts below this need not be found.
     """
@@ -283,7 +283,7 @@ def slow_wander(
     moves = np.abs(moves[np.isfinite(moves)])
     prior = 0.5 * floor_mw
     if len(moves):
-        # A fault moves it once, by more than weather does.
+        # A fault is a single change that is larger than those by weather: limit it.
         usual = max(_MAD_TO_SD * float(np.median(moves)), prior)
         moves = np.minimum(moves, _LARGEST_MOVE * usual)
     power = _PRIOR_BLOCKS * prior**2 + float(np.sum(moves**2))
@@ -291,7 +291,7 @@ def slow_wander(
 
 
 def block_means(residual: FloatArray, weight: ByteArray, rows: int) -> FloatArray:
-    """Return means over ``rows`` rows, shape (n // rows,); NaN where less than half count."""
+    """Return means over ``rows`` rows, shape (n // rows,); NaN if less than half are used."""
     count = len(residual) // rows
     w = weight[: count * rows].reshape(count, rows) > 0
     values = np.where(w, residual[: count * rows].reshape(count, rows), 0.0)
@@ -301,7 +301,7 @@ def block_means(residual: FloatArray, weight: ByteArray, rows: int) -> FloatArra
 
 
 def _correlation(means: FloatArray) -> tuple[float, float]:
-    """Return the correlation from block to block, and the robust sd of what it leaves."""
+    """Return the lag-one correlation of blocks, and the robust sd after removing it."""
     pairs = np.isfinite(means[1:]) & np.isfinite(means[:-1])
     before, now = means[:-1][pairs], means[1:][pairs]
     power = float((before**2).sum())
@@ -316,7 +316,7 @@ def _correlation(means: FloatArray) -> tuple[float, float]:
 
 
 def _innovations(means: FloatArray, correlation: float, sd: float) -> FloatArray:
-    """Whiten as the chart does; blocks that are missing are left out."""
+    """Whiten like the chart; missing blocks are left out."""
     out, before = [], math.nan
     for mean in means.tolist():
         if not math.isnan(mean):
@@ -326,7 +326,7 @@ def _innovations(means: FloatArray, correlation: float, sd: float) -> FloatArray
 
 
 def _drawn(e: FloatArray, length: int) -> FloatArray:
-    """Draw runs of consecutive innovations until ``length`` is reached."""
+    """Resample runs of consecutive innovations up to ``length`` values."""
     rng = np.random.default_rng(_SEED)
     run = max(1, min(_RUN, len(e) // 4))
     if len(e) < 2:
@@ -337,7 +337,7 @@ def _drawn(e: FloatArray, length: int) -> FloatArray:
 
 @jit
 def alarms(e: FloatArray, slack: float, limit: float) -> int:
-    """Count the alarms of a two-sided sum on innovations ``e``; it starts afresh after each."""
+    """Count the alarms of a two-sided sum of innovations ``e``; each alarm resets the sum."""
     up = down = 0.0
     count = 0
     for value in e:
@@ -351,9 +351,9 @@ def alarms(e: FloatArray, slack: float, limit: float) -> int:
 
 @jit
 def peaks(e: FloatArray, slack: float, out: FloatArray) -> int:
-    """Write how high both sums of ``e`` rise between two visits of zero; return how many.
+    """Write the peaks of both sums of ``e`` between two zeros; return the number of peaks.
 
-    ``out`` must hold as many as there are innovations, and two.
+    ``out`` must have the size of ``e`` plus two.
     """
     count = 0
     for sign in (1.0, -1.0):
@@ -373,10 +373,10 @@ def peaks(e: FloatArray, slack: float, out: FloatArray) -> int:
 
 
 def limit_for(e: FloatArray, slack: float, run_length: float) -> float:
-    """Return the limit at which innovations ``e`` give one alarm in ``run_length`` blocks.
+    """Return the two-sided limit at which ``e`` gives one alarm in ``run_length`` blocks.
 
-    A sum starts afresh whenever it comes to zero, so alarms are as frequent as peaks above the
-    limit, and one pass tells that for every limit. Two-sided.
+    A sum restarts whenever it reaches zero, so alarms are as frequent as peaks above the
+    limit, and one pass gives the frequency for every limit.
     """
     out = np.empty(len(e) + 2)
     found = out[: peaks(e, slack, out)]
@@ -389,8 +389,8 @@ def limit_for(e: FloatArray, slack: float, run_length: float) -> float:
 def normal_limit(slack: float, run_length: float) -> float:
     """Return the limit for independent normal innovations by Siegmund's approximation.
 
-    One side: (exp(2 k b) - 1 - 2 k b) / (2 k^2) blocks with b = h + 1.166 (Sequential Analysis,
-    1985); two sides give half of it.
+    One side gives (exp(2 k b) - 1 - 2 k b) / (2 k^2) blocks between alarms with b = h + 1.166
+    (Sequential Analysis, 1985); two sides give half of it.
     """
     low, high = 0.0, _HIGHEST
     for _ in range(60):

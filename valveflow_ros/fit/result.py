@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bring a refined model into the form of the result, with its uncertainties."""
+"""Convert a refined model into the result, with its uncertainties."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def residual_statistics(
     row_sd_mw: float,
     curve_error_mw: float,
 ) -> ResidualStatistics:
-    """Return what clean residuals look like, and the chart that watches for others.
+    """Return the statistics of clean residuals, and the chart that detects a shift.
 
     Parameters
     ----------
     residual, weight : (m,)
-        Of rows, or of means over some, ``step_s`` apart.
+        Of rows or of means over rows, with the step ``step_s``.
     row_sd_mw : float
         sd of single rows.
     curve_error_mw : float
@@ -61,7 +61,7 @@ def residual_statistics(
     sd = _MAD_TO_SD * float(np.median(np.abs(settled - np.median(settled))))
     floor_mw = settings.real('alarm_floor')
     wander_mw = slow_wander(residual, weight, step_s, floor_mw)
-    # The curve's own level is the mean of its days.
+    # The level of the curve is the mean over its days, which has an error of its own.
     level_mw = level_error_mw(wander_mw, 0, round(len(residual) * step_s * NS_PER_S))
     return ResidualStatistics(
         rmse_mw=float(np.sqrt(np.mean(rest**2))),
@@ -85,7 +85,7 @@ def residual_statistics(
 def from_refined(
     task: FitTask, static: Characteristic, result: Refined, samples: Samples, u: FloatArray
 ) -> Characteristic:
-    """Put a refined model into the form of the result, with its uncertainties."""
+    """Convert a refined model into the result, with its uncertainties."""
     m = result.model
     slopes, intercepts = m.slopes(), m.intercepts()
     slope_se, intercept_se = _line_errors(m, result.covariance)
@@ -151,7 +151,7 @@ def from_refined(
 
 
 def _flow_at_ends(m: RegionalModel, samples: Samples) -> FloatArray:
-    """Return the least and the largest flow in MW, of F alone the ends of all pieces."""
+    """Return the smallest and largest flow in MW; without a scale the flow at all piece ends."""
     if samples.scale is None:
         return np.concatenate([m.left, m.right])
     used = samples.usable > 0
@@ -173,7 +173,7 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
         slope_of[:, p] = (high.slopes() - low.slopes()) / (2.0 * h)
         intercept_of[:, p] = (high.intercepts() - low.intercepts()) / (2.0 * h)
 
-    # A region without rows has no known dynamics, which no line leans on.
+    # The dynamics of a region without rows are unknown, but no line depends on them.
     dead = np.isnan(np.diag(covariance))
     known = np.nan_to_num(covariance)
 
@@ -185,28 +185,28 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
     return errors(slope_of), errors(intercept_of)
 
 
-# Whether each piece rests on data of its own: the condition after Proposition 2 of the paper.
+# Test if each piece has data of its own: the condition after Proposition 2 of the paper.
 #
 # Slope and intercept of a piece are determined by the special segments inside it when these
 # are linearly independent: two steady states at different levels, or a slope response that
-# crosses different levels. Where that does not hold, the piece's numbers come from its
-# neighbours through the joins, or from moves between segments, and a person should know.
+# crosses different levels. Otherwise they follow from the neighbouring pieces through the joins,
+# or from the rows between segments, and a note reports this.
 
-NOT_REFINED = 'The curve is not refined: '  # how a note on that begins
-_LEAST_ROWS = 30  # of a segment on a piece, for it to count there
-_APART = 10.0  # noise sd of u between two levels that are called different
+NOT_REFINED = 'The curve is not refined: '  # beginning of a note on that
+_LEAST_ROWS = 30  # minimum rows of a segment inside a piece to be counted
+_APART = 10.0  # minimum difference of two distinct levels, in noise sd of u
 
 
 def with_support(
     c: Characteristic, contents: WindowContents, input_noise: float
 ) -> Characteristic:
-    """Return the characteristic with the support of its pieces, and a note on each without.
+    """Return the characteristic with the support of each piece, and notes on unsupported pieces.
 
     Parameters
     ----------
     c : Characteristic
     contents : WindowContents
-        The rows and special segments it was fitted to.
+        The rows and special segments to which it was fitted.
     input_noise : float
         Noise sd of block means of u.
     """
@@ -223,7 +223,7 @@ def with_support(
 
 
 def wrong_form(c: Characteristic) -> str:
-    """Say that the form was given and is the wrong one; nothing where it is not."""
+    """Return a sentence if the form was given and is wrong; otherwise an empty text."""
     form = c.form
     if form is None or not form.contradicted:
         return ''
@@ -235,7 +235,7 @@ def wrong_form(c: Characteristic) -> str:
 
 
 def forms_apart(form: FormEvidence) -> str:
-    """Say by how much the two forms differ, and where most."""
+    """Return a phrase on how much the two forms differ, and where most."""
     opening, pressure, most = form.worst
     return (
         f'the two differ by {form.apart_mw:.2g} MW (root mean square), at {opening:.0f} % and '
@@ -244,7 +244,7 @@ def forms_apart(form: FormEvidence) -> str:
 
 
 def weaknesses(c: Characteristic) -> tuple[str, ...]:
-    """Return what is to be doubted of a curve: its form, and the notes that report a weakness."""
+    """Return the doubts about a curve: its form, and the notes that report a weakness."""
     form = [wrong_form(c)] if wrong_form(c) else []
     without = sum(1 for found in c.support if not found.identifiable)
     unrefined = [n for n in c.notes[: len(c.notes) - without] if n.startswith(NOT_REFINED)]
@@ -254,10 +254,10 @@ def weaknesses(c: Characteristic) -> tuple[str, ...]:
 def support_of(
     piece: Piece, contents: WindowContents, input_noise: float, last: bool = True
 ) -> Support:
-    """Count the special segments inside a piece, and judge them.
+    """Count the special segments inside a piece, and test if they determine its line.
 
-    A segment counts where half a minute of rows or half of it lies inside. The upper end
-    belongs to the piece only where it is the ``last``.
+    A segment is counted if 30 of its rows or half of them lie inside. The upper end
+    belongs to the piece only if it is the ``last``.
     """
     steady = slope = samples = 0
     levels: list[float] = []
@@ -288,7 +288,7 @@ def support_of(
 
 
 def _distinct(levels: list[float], apart: float) -> list[float]:
-    """Return levels of which each lies more than ``apart`` above the one before."""
+    """Return the levels that are more than ``apart`` above the previous one."""
     found: list[float] = []
     for level in sorted(levels):
         if not found or level - found[-1] > apart:
@@ -297,7 +297,7 @@ def _distinct(levels: list[float], apart: float) -> list[float]:
 
 
 def _sentence(number: int, piece: Piece, found: Support) -> str:
-    """Say what a piece rests on, and what would settle it."""
+    """Return a sentence on the data of a piece, and on the data that it needs."""
     name = f'Piece {number} (u {short(piece.u_from)} to {short(piece.u_to)})'
     if not found.samples:
         rests = 'rests on no special sample'
@@ -320,7 +320,7 @@ def _sentence(number: int, piece: Piece, found: Support) -> str:
 
 
 def _missing(piece: Piece, levels: FloatArray) -> list[float]:
-    """Return where steady states are missing: two places, or the one farther from a level."""
+    """Return where steady states are missing: two points, or the one farther from a level."""
     width = piece.u_to - piece.u_from
     places = [piece.u_from + share * width for share in (0.2, 0.8)]
     if not len(levels):

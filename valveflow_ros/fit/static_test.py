@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A static flow test: steady rows far apart, one opening each, without anything between them.
+"""A static flow test: a table of steady rows with one opening each, and no data between them.
 
-Such a table holds no time constant and no stretch in which noise could be learnt. Its rows are the
-points of the curve: the exact partition with at least four rows a piece, the number of pieces by
-BIC, neighbouring pieces joined in their knots.
+Such a table has no information on time constants and on the noise in time. Its rows are points of
+the curve, which is found by the exact partition with at least four rows per piece. The number of
+pieces is chosen by BIC, and neighbouring pieces are joined.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ from valveflow_ros.records import (
 from valveflow_ros.signals.static_form import integrated_input
 
 STATIC_RULE = 'static_test'
-_PRICE = 1.4  # of a number, in units of Schwarz' log n
+_PRICE = 1.4  # penalty per parameter, in units of Schwarz' log n
 LEAST_ROWS_A_PIECE = 4
 _LEAST_ROWS, _MOST_ROWS = 3 * LEAST_ROWS_A_PIECE, 300
-_PRESSURE_SPREAD = 0.05  # of the mean: at fixed pressure the form of the curve does not matter
+_PRESSURE_SPREAD = 0.05  # of the mean: at constant pressure both forms of the curve are equal
 _LEAST_MOVE_PERCENT = 5.0
 _LARGEST_MISFIT = 0.02  # of the range of the power
-_DYNAMIC_T = 4.0  # of the misfit on the last move: rows that do not stand still depend on it
+_DYNAMIC_T = 4.0  # t value of the last move's effect; above it the rows are not steady
 
 
 @dataclass(frozen=True, slots=True)
 class StaticTest:
-    """What a static test gave.
+    """The result of a static test.
 
     Attributes
     ----------
     characteristic : Characteristic
     segments : tuple of SpecialSegment
-        One a row that counts.
+        One segment for each row that is used.
     """
 
     characteristic: Characteristic
@@ -68,13 +68,13 @@ class StaticTest:
 def find_static_test(table: SampleTable, settings: Settings) -> StaticTest | None:
     """Return the curve of a static test; None if the table does not look like one.
 
-    It does if it has 12 to 300 rows 20 s or more apart, at nearly one pressure and several
-    openings, that lie on a rising curve, and if what is left does not depend on the last move.
+    It must have 12 to 300 rows at least 20 s apart, at nearly constant pressure and several
+    openings, on a rising curve, and the residual must not depend on the last move.
 
     Notes
     -----
     BIC with an unknown variance: n log(S / n) + 1.4 (3 J - 1) log n for J pieces with the sum of
-    squares S. As in a step test, 1.4 is the price of a knee being put where it helps most.
+    squares S. As in a step test, the factor 1.4 allows for the search for the breakpoints.
     """
     step_s = settings.real('sample_period')
     opening, pressure, power = (
@@ -105,7 +105,7 @@ def find_static_test(table: SampleTable, settings: Settings) -> StaticTest | Non
 
 
 def _rows(opening: FloatArray, pressure: FloatArray, power: FloatArray) -> IntArray:
-    """Return rows with all values; of rows that only repeat the one before, the first."""
+    """Return the indices of rows with all values, without repetitions of the previous row."""
     values = np.column_stack([opening, pressure, power])
     known: IntArray = np.flatnonzero(np.isfinite(values).all(axis=1) & (pressure > 0.0))
     new: BoolArray = np.append(True, (np.diff(values[known], axis=0) != 0.0).any(axis=1))
@@ -113,7 +113,7 @@ def _rows(opening: FloatArray, pressure: FloatArray, power: FloatArray) -> IntAr
 
 
 def _line(u: FloatArray, power: FloatArray, most: int) -> BrokenLine | None:
-    """Return the rising broken line with the least BIC, its covariance for noise of 1 MW."""
+    """Return the rising broken line with the smallest BIC; its covariance is for noise of 1 MW."""
     order = np.argsort(u, kind='stable')
     points = Points(u[order], power[order], np.ones(len(u)))
     if np.ptp(points.u) == 0.0:
@@ -134,18 +134,18 @@ def _line(u: FloatArray, power: FloatArray, most: int) -> BrokenLine | None:
 
 
 def _settled(points: Points, line: BrokenLine) -> BrokenLine:
-    """Return the line with its inner knots moved to where the joined pieces fit best."""
+    """Return the line with its inner knots moved to the best fit of the joined pieces."""
     inner = line.knots[1:-1]
     if not len(inner):
         return line
     first, last = line.knots[0], line.knots[-1]
-    # Half a piece each way at most, so that no knot passes another.
+    # At most half a piece in each direction, so that no knot passes another.
     half = 0.45 * np.diff(line.knots)
 
     def rest(knots: FloatArray) -> FloatArray:
         at = np.concatenate([[first], knots, [last]])
         hats = _hats(points.u, at)
-        # The default of NumPy 1 is another one than that of NumPy 2.
+        # The default of `rcond` differs between NumPy 1 and NumPy 2.
         heights = np.linalg.lstsq(hats, points.power_mw, rcond=None)[0]
         return np.asarray(hats @ heights - points.power_mw)
 
@@ -173,7 +173,7 @@ def _squares(points: Points, line: BrokenLine) -> float:
 
 
 def _moves_show(u: FloatArray, rest: FloatArray) -> bool:
-    """Tell whether the misfit depends on the move before a row, as it does while power follows."""
+    """Return True if the misfit depends on the last move, so that the rows are not steady."""
     move = np.diff(u) - np.diff(u).mean()
     left = rest[1:] - rest[1:].mean()
     if not (move @ move) > 0.0 or not (left @ left) > 0.0:
@@ -185,7 +185,7 @@ def _moves_show(u: FloatArray, rest: FloatArray) -> bool:
 def _segment(
     number: int, row: int, table: SampleTable, u: FloatArray, power: FloatArray
 ) -> SpecialSegment:
-    """Return a row as the steady state it is."""
+    """Return a row as a steady-state segment."""
     at_ns = int(table.time_ns[row])
     return SpecialSegment(
         number=number, kind=SegmentKind.STEADY, start_ns=at_ns, end_ns=at_ns, samples=1,
@@ -203,7 +203,7 @@ def _characteristic(
     rest: FloatArray,
     settings: Settings,
 ) -> Characteristic:
-    """Bring the line into the form of every result."""
+    """Convert the line into a characteristic."""
     pieces = pieces_of_line(line, u[rows])
     step_s = settings.real('sample_period')
     sd = max(float(np.std(rest)), 1e-9)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The levels of a manual step test: held openings, and the settled part of each."""
+"""The levels of a manual step test: openings that are held, and the settled part of each."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from valveflow_ros.fit.whitening import yule_walker
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable, Signal
 
-_LEAST_STEP_PERCENT = 0.3  # smaller moves of the opening are wander within a level
+_LEAST_STEP_PERCENT = 0.3  # smaller changes of the opening are noise within a level
 _MAD_TO_SD = 1.4826022185056018
-_NOISES = 6.0  # and so are moves within so many noise sd
-_SURE = 3.0  # errors by which both halves of a level must differ to be called moving
+_NOISES = 6.0  # and so are changes within this many noise sd
+_SURE = 3.0  # a level is moving if its halves differ by more than this many standard errors
 _ORDER = 2  # of the autoregressive model of the block means
 _LARGEST_SUM = 0.95
 _ROUNDS = 8
-_GAP = 1.5  # sample periods between rows from which on time is missing
-_DUST = 1e-6  # of a power: what it is taken to be wrong by at least
+_GAP = 1.5  # a larger step between rows, in sample periods, is a gap
+_DUST = 1e-6  # minimum error of a power, as a fraction
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One opening that was held.
+    """An opening that was held.
 
     Attributes
     ----------
     first, end : int
         Rows of its settled part, ``[first, end)``; equal if it has none.
     held_s : float
-        How long it was held, the transient included.
+        Time for which it was held, including the transient.
     opening_percent, pressure_mpa, u, power_mw : float
-        Means over the settled part; NaN without one, but for the opening.
+        Means over the settled part; without one they are NaN, except the opening.
     power_error_mw : float
-        Standard error of the mean power, correlation in time allowed for.
+        Standard error of the mean power; it allows for correlation in time.
     problem : str
-        Why the level does not count, the end of a sentence; empty if it does.
+        Why the level is not used, as the end of a sentence; empty if it is used.
     """
 
     first: int
@@ -66,10 +66,10 @@ def holds(
 ) -> list[tuple[int, int]]:
     """Return the stretches ``[first, end)`` of rows in which the opening was held.
 
-    A block mean that leaves the running mean of a stretch by more than the smallest step, or
-    more than the noise between rows explains, ends it. Stretches shorter than
-    ``least_blocks`` blocks are moves. ``gaps`` are rows before which time is missing: nobody
-    knows what the valve did there, so none lies within a stretch.
+    A stretch ends when a block mean differs from the running mean of the stretch by more than
+    the smallest step and by more than the noise explains. Stretches shorter than
+    ``least_blocks`` blocks are moves. ``gaps`` are the rows after a gap in time: the movement
+    of the valve is unknown there, so no stretch contains a gap.
     """
     limit = max(_LEAST_STEP_PERCENT, _NOISES * _white(opening) / math.sqrt(block))
     edges = itertools.pairwise([0, *gaps, len(opening)])
@@ -103,14 +103,14 @@ def _stretches(
 
 
 def _white(opening: FloatArray) -> float:
-    """Return the sd of the opening's noise from one row to the next, moves left out."""
+    """Return the sd of the opening's white noise, without the effect of moves."""
     bends = np.abs(np.diff(opening, 2))
     bends = bends[np.isfinite(bends)]
     return _MAD_TO_SD * float(np.median(bends)) / math.sqrt(6.0) if len(bends) else 0.0
 
 
 def find_levels(table: SampleTable, u: FloatArray, settings: Settings) -> list[Level]:
-    """Return all levels in order of time, those that do not count among them.
+    """Return all levels in chronological order, including those that are not used.
 
     Parameters
     ----------
@@ -118,14 +118,14 @@ def find_levels(table: SampleTable, u: FloatArray, settings: Settings) -> list[L
     u : float64 (n,)
         Integrated input of each row.
     settings : Settings
-        ``time_constant`` and ``delay`` give the transient 5 T + tau that does not count,
-        ``steady_min`` what must be left after it (what was held for less is no level),
+        ``time_constant`` and ``delay`` give the transient 5 T + tau that is ignored,
+        ``steady_min`` the minimum time after it (a shorter hold is no level),
         ``block`` the length of means.
 
     Notes
     -----
-    One level alone is too short to tell how long its noise remembers, so all others together
-    say how much the mean of a level scatters, and those that count say it in the end.
+    One level is too short to estimate the correlation time of its noise. So the error of a mean
+    is estimated from all other levels together, and finally from all levels that are used.
     """
     step_s = settings.real('sample_period')
     block = max(1, round(settings.real('block') / step_s))
@@ -139,7 +139,7 @@ def find_levels(table: SampleTable, u: FloatArray, settings: Settings) -> list[L
         gaps.tolist(),
     )  # fmt: skip
     parts = [(a + settle, b) if b - a >= settle + least else (b, b) for a, b in held]
-    # A log may begin inside a hold that has lasted: nothing tells, so its transient goes too.
+    # If a log begins during a hold, its earlier duration is unknown: ignore a transient, too.
     power = np.ascontiguousarray(table.column(Signal.GENERATED_POWER))
     settled = [k for k, (a, b) in enumerate(parts) if b > a]
     blocks = {k: _means(power[slice(*parts[k])], block) for k in settled}
@@ -154,17 +154,17 @@ def find_levels(table: SampleTable, u: FloatArray, settings: Settings) -> list[L
 
 
 def _means(values: FloatArray, block: int) -> FloatArray:
-    """Return block means, what is left over at the end let go."""
+    """Return block means; an incomplete block at the end is ignored."""
     count = max(1, len(values) // block)
     width = min(block, len(values))
     return np.asarray(values[: count * width].reshape(count, width).mean(axis=1))
 
 
 def _resolution(parts: Sequence[FloatArray]) -> float:
-    """Return the sd of rounding in MW: a power that stands still is not known without error.
+    """Return the sd of rounding in MW: even a constant power has an error.
 
-    That of the smallest step between the powers logged, and never nothing: without an error
-    a level would weigh infinitely much.
+    It follows from the smallest step between the logged powers. It is never 0: a level
+    without an error would have an infinite weight.
     """
     values = np.unique(np.concatenate([*parts, np.empty(0)]))
     if not len(values):
@@ -178,7 +178,7 @@ def _resolution(parts: Sequence[FloatArray]) -> float:
 
 
 def _moves(blocks: dict[int, FloatArray], k: int, least_sd: float) -> bool:
-    """Tell whether the halves of a level differ by more than the noise of the others explains."""
+    """Return True if the halves of a level differ by more than the others' noise explains."""
     others = [v for number, v in blocks.items() if number != k]
     own = blocks[k]
     half = len(own) // 2
@@ -189,18 +189,18 @@ def _moves(blocks: dict[int, FloatArray], k: int, least_sd: float) -> bool:
 
 
 def long_run_sd(series: Sequence[FloatArray]) -> float:
-    """Return ``sd`` such that the mean of n values of such noise has the error ``sd / sqrt(n)``.
+    """Return ``sd`` such that the mean of n values of this noise has the error ``sd / sqrt(n)``.
 
     Parameters
     ----------
     series : sequence of float64 (n,)
-        Stretches of the same noise, each about a mean of its own.
+        Stretches of the same noise, each with its own mean.
 
     Notes
     -----
-    From an autoregressive model by Yule and Walker. Taking each stretch about its own mean
-    takes the variance V of that mean off every autocovariance; V is put back, and found anew
-    from the model, until both agree.
+    The result is that of a Yule-Walker AR model. Subtracting its own mean from each stretch
+    reduces every autocovariance by the variance V of that mean. V is added again and
+    recomputed from the model, for a fixed number of iterations.
     """
     rest = [v - v.mean() for v in series]
     lags = range(_ORDER + 1)
@@ -215,7 +215,7 @@ def long_run_sd(series: Sequence[FloatArray]) -> float:
     of_mean = 0.0
     for _ in range(_ROUNDS):
         covariance = found + of_mean
-        covariance[0] *= 1.0 + 1e-9  # solvable for a noise that hardly varies
+        covariance[0] *= 1.0 + 1e-9  # keeps the system solvable for almost constant values
         ar = yule_walker(covariance)
         total = min(float(ar.sum()), _LARGEST_SUM)
         innovation = max(float(covariance[0] - ar @ covariance[1:]), 0.0)
@@ -260,10 +260,10 @@ def _level(
 
 
 def looks_like_step_test(table: SampleTable, settings: Settings) -> bool:
-    """Tell whether the opening was moved by hand: few levels, each held, hardly anything between.
+    """Return True if the opening was changed by hand: few levels, held most of the time.
 
-    Load control keeps the valve in motion even where the load rests, so that few minutes pass
-    without a move beyond its noise.
+    Load control moves the valve even at constant load, so that within a few minutes it moves
+    by more than its noise.
     """
     step_s = settings.real('sample_period')
     block = max(1, round(settings.real('block') / step_s))

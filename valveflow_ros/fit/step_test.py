@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The traditional manual test: constant pressure, the opening in steps, a mean at each level.
+"""The traditional manual test: constant pressure, opening changed in steps, a mean per level.
 
-Section I of the paper names it as what plants do today. Its log is not ordinary operation:
-nothing streams, and only settled levels count.
+Section I of the paper describes it as the present practice of plants. Its log is no ordinary
+operation: it is evaluated as a whole, and only settled levels are used.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from valveflow_ros.signals.static_form import integrated_input
 
 # A rising broken line through the levels of a step test.
 
-ENOUGH = 8  # levels from which on pieces are put through several of them
-_LEAST_LEVELS = 2  # of a piece
-# Of a number, in units of Schwarz' log n. A knee is put where it helps most, so the best of many
-# places looks better than it is; at 1.4 noise alone gives one in 4 of 100 tests, at 1 in 10.
+ENOUGH = 8  # from this number of levels on, each piece is fitted to several of them
+_LEAST_LEVELS = 2  # per piece
+# Penalty per parameter, in units of Schwarz' log n. The best of many positions of a breakpoint
+# fits well by chance: at 1.4 noise gives a false one in 4 of 100 tests, at 1 in 10 of 100.
 _PRICE = 1.4
 _Z95 = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Means of levels in order of u; all arrays have shape (n,)."""
+    """Means of levels, sorted by u; all arrays have shape (n,)."""
 
     u: FloatArray
     power_mw: FloatArray
@@ -65,11 +65,11 @@ class BrokenLine:
     ----------
     knots, values : float64 (J + 1,)
     covariance : float64 (J + 1, J + 1)
-        Of the values, the knots held.
+        Of the values, with the knots kept fixed.
     knot_error : float64 (J - 1,)
-        Standard errors of the inner knots; NaN where a level is the knot.
+        Standard errors of the inner knots; NaN if a level is the knot.
     cost : dict
-        Weighted sum of squares by number of pieces; empty if a level is a knot each.
+        Weighted sum of squares by number of pieces; empty if each level is a knot.
     """
 
     knots: FloatArray
@@ -80,11 +80,11 @@ class BrokenLine:
 
 
 def pooled(points: Points, near_u: float) -> tuple[Points, list[int]]:
-    """Return levels in rising order of u, and how many went into each.
+    """Return levels in rising order of u, and the number of levels merged into each.
 
-    Levels closer than ``near_u`` are one: the same opening visited twice. Where each level
-    becomes a knot, one that gives no more power than the one below it is joined with it, as
-    means weighted by their errors (pool adjacent violators): the curve must rise.
+    Levels closer than ``near_u`` are merged: the same opening was visited twice. If each level
+    is a knot, a level with no more power than the one below is merged with it, as means
+    weighted by their errors (pool adjacent violators), because the curve must rise.
     """
     found = _groups(points, near_u, rising=False)
     return found if len(found[0]) >= ENOUGH else _groups(points, near_u, rising=True)
@@ -114,21 +114,21 @@ def _groups(points: Points, near_u: float, rising: bool) -> tuple[Points, list[i
 
 
 def broken_line(points: Points, most: int) -> BrokenLine:
-    """Put the line through: a knot at each level, or the exact partition where levels suffice.
+    """Fit the line: a knot at each level, or the exact partition if there are enough levels.
 
     Parameters
     ----------
     points : Points
-        Rising.
+        In rising order.
     most : int
         Largest number of pieces tried.
 
     Notes
     -----
-    The partition of the levels into pieces of at least two is exact (all are compared by a
-    dynamic programme); their number is the one with the least weighted sum of squares plus
-    ``1.4 log n`` for each of the 3 J - 1 numbers it takes. Neighbouring lines meet in knots, and
-    the values there are fitted again together. A piece that would fall is not taken.
+    The partition of the levels into pieces of at least two is exact (by dynamic programming).
+    Their number J minimises the weighted sum of squares plus ``1.4 log n`` for each of the
+    3 J - 1 parameters. Neighbouring lines are joined at knots, and the values there are refitted
+    together. A line with a falling piece is rejected.
     """
     n = len(points)
     if n < ENOUGH:
@@ -150,7 +150,7 @@ def broken_line(points: Points, most: int) -> BrokenLine:
 
 
 def _line(points: Points, a: int, b: int) -> tuple[FloatArray, FloatArray, float]:
-    """Return value and slope about the middle, their covariance, and the cost of levels [a, b)."""
+    """Return value at the middle, slope, their covariance, and the cost of levels [a, b)."""
     w = 1.0 / points.error_mw[a:b]
     middle = float(points.u[a:b].mean())
     design = np.column_stack([w, w * (points.u[a:b] - middle)])
@@ -168,7 +168,7 @@ def _line(points: Points, a: int, b: int) -> tuple[FloatArray, FloatArray, float
 def partition_points(
     points: Points, most: int, least: int = _LEAST_LEVELS
 ) -> tuple[dict[int, list[int]], dict[int, float]]:
-    """Return starts and costs of pieces of at least ``least`` points, by their number."""
+    """Return starts and costs of pieces of at least ``least`` points, by number of pieces."""
     n = len(points)
     error = np.full((n + 1, n + 1), math.inf)
     for a in range(n):
@@ -194,7 +194,7 @@ def partition_points(
 
 
 def joined(points: Points, starts: list[int], cost: dict[int, float]) -> BrokenLine:
-    """Let neighbouring lines meet, and fit the values at the knots together."""
+    """Join neighbouring lines, and fit the values at the knots together."""
     ends = [*starts[1:], len(points)]
     lines = [_line(points, a, b) for a, b in zip(starts, ends, strict=True)]
     knots, errors = [float(points.u[0])], []
@@ -228,22 +228,22 @@ def interval(knot: float, error: float) -> tuple[float, float]:
 PRESSURE_SPREAD_PERCENT = 3.0
 LEAST_LEVELS = 3
 RULE = 'step_test'
-_HELD_LEAST = 0.5  # of the time: the rest are moves
-_TOLD = 5  # levels left out that are named one by one
-_NEAR = 0.005  # of the range of u: closer levels are one opening visited twice
+_HELD_LEAST = 0.5  # of the time; moves take the rest
+_TOLD = 5  # maximum number of omitted levels that are named
+_NEAR = 0.005  # of the range of u: closer levels are the same opening
 
 
 @dataclass(frozen=True, slots=True)
 class StepTest:
-    """What a step test gave.
+    """The result of a step test.
 
     Attributes
     ----------
     characteristic : Characteristic
     levels : tuple of Level
-        All that were found, in order of time.
+        All levels that were found, in chronological order.
     segments : tuple of SpecialSegment
-        The settled parts of those that count.
+        The settled parts of the levels that are used.
     pressure_spread_percent : float
         Central 95 % of the pressure in the settled parts, in % of its mean.
     """
@@ -255,13 +255,13 @@ class StepTest:
 
 
 def identify_step_test(table: SampleTable, settings: Settings) -> StepTest:
-    """Find the curve of a step test.
+    """Identify the curve of a step test.
 
     Raises
     ------
     DataError
         Too few levels, the pressure was not constant, or the power does not rise with the
-        opening; the sentence says what was found.
+        opening; the message says what was found.
     """
     opening = np.ascontiguousarray(table.column(Signal.VALVE_OPENING))
     pressure = table.column(Signal.MAIN_STEAM_PRESSURE)
@@ -307,7 +307,7 @@ def identify_step_test(table: SampleTable, settings: Settings) -> StepTest:
 
 
 def _is_one(levels: Sequence[Level], table: SampleTable, settings: Settings) -> None:
-    """Refuse ordinary operation, in which the valve is hardly ever held."""
+    """Raise `DataError` for ordinary operation, in which the valve is rarely held."""
     held_s = sum(v.held_s for v in levels)
     all_s = max(len(table), 1) * settings.real('sample_period')
     if held_s < _HELD_LEAST * all_s:
@@ -319,7 +319,7 @@ def _is_one(levels: Sequence[Level], table: SampleTable, settings: Settings) -> 
 
 
 def _pressure_spread(pressure: FloatArray) -> float:
-    """Return the spread in %; refuse one that makes the test something else."""
+    """Return the spread in %; raise `DataError` if it is too large for a step test."""
     low, high = np.quantile(pressure, (0.025, 0.975))
     spread = 100.0 * float(high - low) / float(pressure.mean())
     if spread > PRESSURE_SPREAD_PERCENT:
@@ -332,7 +332,7 @@ def _pressure_spread(pressure: FloatArray) -> float:
 
 
 def form_note(pressure: FloatArray) -> str:
-    """Say that a test at one pressure does not tell the form of the static power."""
+    """Return a note that a test at one pressure does not determine the form of the power."""
     return (
         f'The pressure stayed between {pressure.min():.2f} and {pressure.max():.2f} MPa: whether '
         'the power follows F(V p^m), as this curve does, or p^m F(V) + c cannot be told from '
@@ -372,7 +372,7 @@ def _left_out(levels: Sequence[Level]) -> list[str]:
 def _segment(
     number: int, table: SampleTable, u: FloatArray, level: Level, settings: Settings
 ) -> SpecialSegment:
-    """Return a level's settled part as the steady-state segment it is."""
+    """Return a level's settled part as a steady-state segment."""
     part = slice(level.first, level.end)
     power = table.column(Signal.GENERATED_POWER)[part]
     temperature = table.column(Signal.MAIN_STEAM_TEMPERATURE)[part]
@@ -403,7 +403,7 @@ def _characteristic(
     settings: Settings,
     notes: tuple[str, ...],
 ) -> Characteristic:
-    """Bring the line into the form of every result."""
+    """Convert the line into a characteristic."""
     pieces = pieces_of_line(line, u[inside])
     if line.cost:
         why = (
@@ -429,7 +429,7 @@ def _characteristic(
 
 
 def pieces_of_line(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:
-    """Return the pieces of a line with their errors; ``u`` are the samples behind it."""
+    """Return the pieces of a line with their errors; ``u`` are the samples of the line."""
     knots, values, covariance = line.knots, line.values, line.covariance
     counts = np.histogram(u, bins=np.concatenate([[-np.inf], knots[1:-1], [np.inf]]))[0]
     pieces = []
@@ -450,7 +450,7 @@ def pieces_of_line(line: BrokenLine, u: FloatArray) -> tuple[Piece, ...]:
 def tested_data(
     table: SampleTable, inside: IntArray, levels: int, settings: Settings
 ) -> FittedData:
-    """Describe the rows of a test and the temperature in them."""
+    """Return the description of a test's rows, including the temperature."""
     return FittedData.of(
         table.time_ns, levels, 0, table.column(Signal.MAIN_STEAM_TEMPERATURE)[inside],
         settings.real('temperature_spread_limit'),
@@ -464,7 +464,7 @@ def _residuals(
     line: BrokenLine,
     settings: Settings,
 ) -> ResidualStatistics:
-    """Describe the rows of the settled parts about the curve, and their block means."""
+    """Return the residual statistics of rows and block means in the settled parts."""
     power = table.column(Signal.GENERATED_POWER)
     block = max(1, round(settings.real('block') / settings.real('sample_period')))
     rest, means, still = [], [], []

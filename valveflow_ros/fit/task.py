@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit is asked to do."""
+"""The task of a fit."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from valveflow_ros.signals.static_form import StaticForm
 
 @dataclass(frozen=True, slots=True)
 class FitTask:
-    """Everything a fit depends on.
+    """All inputs of a fit.
 
     Attributes
     ----------
     request_ns : int
-        Time of the row after which the fit was asked for; its name.
+        Time of the last row before the request; it identifies the fit.
     contents : WindowContents
     settings : Settings
     input_noise, power_noise_mw : float
         The segmenter's noise levels at that moment.
     held : tuple of HeldCause
-        Causes that were taken out of the rows.
+        Causes that were removed from the rows.
     form : StaticForm, optional
-        The form of the curve; without it the data choose.
+        The form of the curve; by default it is chosen from the data.
     known : StaticForm, optional
-        What earlier data told of the form.
+        The form that was found from earlier data.
     """
 
     request_ns: int
@@ -46,16 +46,16 @@ class FitTask:
     known: StaticForm | None = None
 
 
-# Windows that cannot carry a curve, and what would help.
+# Windows that do not determine a curve, with advice in the messages.
 
-COARSE_STEP_S = 20.0  # from this step of the table on, a floor is told in rows of it
-_EXPLAINED_LEAST = 0.5  # share of the power's variance a curve must explain to be one
-_ONE_LEVEL_PERCENT = 2.0  # of opening: less than this is one load with its jitter
-_LEAST_SPREAD = 10.0  # noise sd that the openings must spread over
+COARSE_STEP_S = 20.0  # from this step on, messages state minimum durations in rows
+_EXPLAINED_LEAST = 0.5  # minimum fraction of the power's variance that a curve must explain
+_ONE_LEVEL_PERCENT = 2.0  # of opening: a smaller range is a single load with noise
+_LEAST_SPREAD = 10.0  # minimum range of the openings, in noise sd
 
 
 def evaluate(pieces: tuple[Piece, ...], u: FloatArray) -> FloatArray:
-    """Return the power in MW of a curve at ``u``; at a knot that of the piece to its right."""
+    """Return the power of a curve at ``u`` in MW; at a knot that of the piece to its right."""
     inner = np.array([p.u_to for p in pieces[:-1]])
     k = np.searchsorted(inner, u, side='right')
     slopes = np.array([p.slope for p in pieces])
@@ -63,7 +63,7 @@ def evaluate(pieces: tuple[Piece, ...], u: FloatArray) -> FloatArray:
 
 
 def enough_samples(task: FitTask, samples: int) -> None:
-    """Refuse a window that cannot carry a fit, and say what would help."""
+    """Raise `DataError` with advice if a window does not permit a fit."""
     c = task.contents
     usable = np.isfinite(c.u) & np.isfinite(c.power_mw)
     if not usable.any():
@@ -87,7 +87,7 @@ def enough_samples(task: FitTask, samples: int) -> None:
 
 
 def input_moved(task: FitTask, u: FloatArray) -> None:
-    """Refuse samples that lie at one opening: their scatter has no slope to tell."""
+    """Raise `DataError` if all samples are at one opening: they determine no slope."""
     low, high = np.quantile(u, (0.01, 0.99))
     if high - low < _LEAST_SPREAD * task.input_noise:
         raise DataError(
@@ -98,10 +98,10 @@ def input_moved(task: FitTask, u: FloatArray) -> None:
 
 
 def valve_moved(task: FitTask, rows: IntArray) -> None:
-    """Refuse samples whose u was moved by the pressure alone.
+    """Raise `DataError` if only the pressure changed u.
 
-    They may follow a curve well, since power follows the pressure; but it is no
-    characteristic of the valve, and a dead transmitter gives the same.
+    Such samples may fit a curve well, since power depends on the pressure. But it is no
+    characteristic of the valve, and a stuck opening transmitter gives the same.
     """
     if not len(task.contents.opening_percent):
         return
@@ -120,7 +120,7 @@ def valve_moved(task: FitTask, rows: IntArray) -> None:
 
 
 def carries_a_curve(task: FitTask, rows: IntArray, pieces: int, static_mw: FloatArray) -> None:
-    """Refuse a relation so loose that a curve through it, of some pieces, would mislead."""
+    """Raise `DataError` if the scatter is so large that a curve would be misleading."""
     power = task.contents.power_mw[rows]
     rest = power - static_mw
     total = float(np.var(power))

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How sure the parameters are, with noise that is correlated and depends on what happens."""
+"""Uncertainty of the parameters with noise that is correlated and depends on the operation."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ _MOST_BLOCKS = 60
 # Weather and the load of a day last longer than the blocks above: the errors of the final fit are
 # also taken from this many long blocks.
 _LONG_BLOCKS = 10
-# Directions of the scaled normal matrix below this are rounding, some of them negative.
+# Smaller eigenvalues of the scaled normal matrix are rounding errors; some are negative.
 _SINGULAR = 1e-12
 _LEAST_IN_BLOCK_S = 500.0
-# The answer is not smooth in a level: half this many MW to both sides average over what lies near.
+# The answer is not smooth in a level: a central difference over this step averages it.
 _LEVEL_STEP_MW = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Certainty:
-    """Covariance of what was estimated.
+    """Covariance of the estimates.
 
     Attributes
     ----------
     covariance : float64 (P, P)
-        Of the packed parameters. What was not free has 0; what was free and is not moved by
-        the data has NaN.
+        Of the packed parameters. It is 0 for fixed parameters, and NaN for free parameters that
+        are not determined by the data.
     level_stderr : float64 (I - 1,)
         Standard errors of the levels between regions, MW.
     innovation_mw : float
         sd of the whitened residual.
     prediction_mw : float
-        How wrong the prediction is because parameters are: root mean square over all rows.
+        Error of the prediction due to the errors of the parameters: root mean square of all rows.
     """
 
     covariance: FloatArray
@@ -55,11 +55,11 @@ def covariance_of(
     ar: FloatArray,
     final: bool = True,
 ) -> Certainty:
-    """Return how sure the packed parameters are.
+    """Return the covariance of the packed parameters, and in the ``final`` fit of the levels.
 
-    The inverse normal matrix, widened where sums of scores over blocks vary
-    more than independent innovations would let them. In the final fit long blocks count too,
-    and the levels are parameters, by differences: time constants and delays depend on them.
+    The inverse normal matrix is widened if sums of scores over blocks vary more than with
+    independent innovations. In the final fit long blocks count too, and the levels are
+    parameters with derivatives by differences: time constants and delays depend on them.
     """
     packed, levels = len(free), len(model.levels) if final else 0
     residual, jacobian, weight = problem.tangents(model, also=levels)
@@ -80,7 +80,7 @@ def covariance_of(
         long_robust = np.diag(inverse @ gram(long) @ inverse)
         robust = np.maximum(robust, long_robust * (_LONG_BLOCKS / (_LONG_BLOCKS - 1)))
     plain = inverse * variance
-    # Few blocks make the robust form noisy; it may widen, never narrow.
+    # The robust form is noisy with few blocks: it may only increase the variance.
     diagonal = np.maximum(np.diag(plain), 1e-300)
     widen = np.sqrt(np.maximum(1.0, robust / diagonal))
     covariance = np.zeros((len(free), len(free)))
@@ -96,14 +96,14 @@ def covariance_of(
 
 
 def _prediction_error(jacobian: FloatArray, weight: ByteArray, covariance: FloatArray) -> float:
-    """Return the root mean square of what errors of the parameters do to the answer."""
+    """Return the root mean square error of the answer due to errors of the parameters."""
     sums, _, rows = normal_equations(jacobian, np.zeros(len(weight)), weight, np.empty(0))
     square = np.sum(sums[:-1, :-1] * covariance) / max(rows, 1)
     return float(np.sqrt(max(square, 0.0)))
 
 
 def _blocks(problem: Problem) -> int:
-    """Return into how many blocks of time the window is cut."""
+    """Return the number of time blocks into which the window is divided."""
     rows = max(1, round(_LEAST_IN_BLOCK_S / (problem.samples.step_s * problem.samples.group)))
     return max(1, min(_MOST_BLOCKS, problem.samples.means // rows))
 
@@ -122,13 +122,13 @@ def _level_tangents(problem: Problem, model: RegionalModel, columns: FloatArray)
 def bend_certainty(problem: Problem, model: RegionalModel, ar: FloatArray) -> FloatArray:
     """Return half the squared change of slope over its variance, for each inner knot (J - 1,).
 
-    That is the log-likelihood a knee is worth, with the robust variance.
+    That is the gain in log-likelihood by a breakpoint, with the robust variance.
     """
     j = model.pieces
     free = np.zeros(len(model.pack()), dtype=bool)
     free[: j + 1] = True
     covariance = covariance_of(problem, model, free, ar, final=False).covariance
-    # A value that no row moves is not known, and no bend at it is certain.
+    # A value without rows is unknown: a large variance gives its breakpoints no gain.
     covariance = np.nan_to_num(covariance[: j + 1, : j + 1], nan=1e12)
     width = np.diff(model.knots)
     change = np.zeros((j - 1, j + 1))

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An autoregressive model of the residual, so that its samples may be counted as independent."""
+"""An autoregressive model that whitens the residual, so that its samples are independent."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from valveflow_ros.records import ByteArray, FloatArray
 
 ORDER = 4
 _LARGEST_SUM = 0.95
-# Rows whose sums are formed by themselves and then added in order: the bits do not depend on the
-# number of threads.
+# Sums are formed over stretches of this many rows and then added in order, so that the result
+# does not depend on the number of threads.
 _STRETCH = 16384
 
 
 def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> FloatArray:
     """Estimate AR coefficients by Yule-Walker over the weighted rows, shape (order,).
 
-    Rows with weight 0 neither count nor connect their neighbours. A residual
-    without power gives zeros.
+    Rows with weight 0 are ignored and separate their neighbours. A residual of
+    zeros gives zeros.
     """
     products = lagged_products(residual, weight, order)
     if not products[0] > 0.0:
         return np.zeros(order)
-    # A touch of white noise keeps the system solvable for a residual that hardly varies.
+    # A little white noise keeps the system solvable for an almost constant residual.
     products[0] *= 1.0 + 1e-9
     ar = yule_walker(products)
-    # A residual that still holds a misfit looks like a random walk, and whitening by a
-    # root at one would make levels, and with them the misfit, invisible.
+    # A residual that contains a misfit looks like a random walk. Whitening with a root at one
+    # would remove the level and hide the misfit.
     total = float(ar.sum())
     return ar * (_LARGEST_SUM / total) if total > _LARGEST_SUM else ar
 
 
 def yule_walker(products: FloatArray) -> FloatArray:
-    """Solve for the coefficients whose process has these mean products at lags 0 to k, (k,).
+    """Return the AR coefficients (k,) of a process with these mean products at lags 0 to k.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def yule_walker(products: FloatArray) -> FloatArray:
     """
     if not np.isfinite(products).all():
         raise np.linalg.LinAlgError('the residual is not finite')
-    # By Levinson's recursion: the last bits of a library's solver depend on the number of threads.
+    # Levinson's recursion, because the last bits of a library's solver depend on the threads.
     ar, error = np.zeros(0), float(products[0])
     for k in range(len(products) - 1):
         if error == 0.0:
@@ -60,7 +60,7 @@ def yule_walker(products: FloatArray) -> FloatArray:
 def normal_equations(
     jacobian: FloatArray, residual: FloatArray, weight: ByteArray, ar: FloatArray, blocks: int = 1
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Return products of whitened tangents and residual, block scores, and the rows counted.
+    """Return products of whitened tangents and residual, block scores, and the number of rows.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def normal_equations(
     residual, weight : (m,)
     ar : float64 (k,)
     blocks : int
-        Even stretches of time for which scores are added up.
+        Number of equal stretches of time for which scores are summed.
 
     Returns
     -------
@@ -104,9 +104,9 @@ def whitened(columns: FloatArray, weight: ByteArray, ar: FloatArray) -> FloatArr
 
 
 def inflation(residual: FloatArray, weight: ByteArray, longest_lag: int) -> float:
-    """Return how many times the variance of a long mean exceeds that of white noise.
+    """Return the ratio of the variance of a long mean to that of white noise.
 
-    Bartlett-weighted sum of autocorrelations up to ``longest_lag``; at least 1.
+    It is the Bartlett-weighted sum of autocorrelations up to ``longest_lag``; at least 1.
     """
     products = lagged_products(residual, weight, longest_lag)
     if not products[0] > 0.0:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``compare`` and ``validate``: curves judged on data that they were not made from."""
+"""``compare`` and ``validate``: curves tested on data that were not used to identify them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 
 @dataclass(frozen=True, slots=True)
 class ComparisonResult(Result):
-    """The proposed method beside two of the literature; ``data`` is what the report shows."""
+    """The proposed method and two methods of the literature; ``data`` is shown in the report."""
 
     verb = 'compare'
     data: Compared
@@ -63,7 +63,7 @@ class ComparisonResult(Result):
 
     @property
     def comparison(self) -> comparison.Comparison:
-        """Return curves, errors and tests."""
+        """Return the curves, errors and tests."""
         return self.data.result
 
     def page(self) -> Page:
@@ -91,19 +91,19 @@ class ComparisonResult(Result):
 
 @dataclass(frozen=True, slots=True)
 class ValidationResult(Result):
-    """A curve held against a log; ``data`` is what the report shows."""
+    """A curve compared with a log; ``data`` is shown in the report."""
 
     verb = 'validate'
     data: Validated
 
     @property
     def output_unit(self) -> str:
-        """Return the unit of the curve's output, which is that of the log's."""
+        """Return the unit of the curve's output, which is also that of the log's output."""
         return self.data.result.characteristic.output_unit
 
     @property
     def validation(self) -> validation.Validation:
-        """Return verdict, pieces and errors."""
+        """Return the verdict, the pieces and the errors."""
         return self.data.result
 
     def page(self) -> Page:
@@ -137,14 +137,14 @@ def compare(
     parameters: Mapping[str, Any] | None = None,
     progress: Progress = SILENT,
 ) -> ComparisonResult:
-    """Identify the curve in three ways and judge all of them on data none has seen.
+    """Identify the curve with three methods and compare them on held-out data.
 
     Parameters
     ----------
     log : Log, str, Path or pandas.DataFrame
-        The log to learn from: what `open_log` returned, or anything it opens.
+        The log used for fitting: the result of `open_log`, or anything that it opens.
     test : Log, str, Path or pandas.DataFrame, optional
-        A log of other days to judge by; without it the last third of ``log`` is held back.
+        A log of other days for the test; without it the last third of ``log`` is held out.
     truth : Truth or path, optional
         The true curve of a simulated plant.
     parameters : mapping, optional
@@ -154,9 +154,9 @@ def compare(
     Raises
     ------
     RecordingError, InputError, DataError
-        A log cannot be read, carries no curve, or holds nothing to judge by.
+        A log cannot be read, determines no curve, or contains no data for the test.
     """
-    # The other methods are the paper's: they simulate from V p^m.
+    # The other two methods are used as in the paper: their input is V p^m.
     given = {**(parameters or {}), 'axis': INTEGRATED_INPUT}
     if truth is not None and not isinstance(truth, Truth):
         truth = load_truth(truth)
@@ -169,7 +169,7 @@ def compare(
         first, second = log, _not_empty(as_log(test, progress))
         names = first.name, second.name
     learn, settings, notes = _see(first, names[0], given, progress, progress.part(0.0, 0.4))
-    # A discrete model runs at the step it was learnt at.
+    # A discrete model must be simulated at the step at which it was fitted.
     given['sample_period'] = settings.real('sample_period')
     judged, other, more = _see(second, names[1], given, progress, progress.part(0.2, 0.4))
     progress(0.4, 'curve of special segments')
@@ -199,17 +199,17 @@ def validate(
     parameters: Mapping[str, Any] | None = None,
     progress: Progress = SILENT,
 ) -> ValidationResult:
-    """Hold a characteristic against a log it was not made from.
+    """Compare a characteristic with a log that was not used to identify it.
 
     Parameters
     ----------
     log : Log, str, Path or pandas.DataFrame
-        What `open_log` returned, or anything it opens.
+        The result of `open_log`, or anything that it opens.
     model : Characteristic, ExtendedModel or path
     against : Characteristic or path, optional
-        A second curve, to see which of the two is better.
+        A second curve; the result says which of the two is better.
     tolerance_mw : float, optional
-        A mean difference that does not matter; the parameter ``alarm_floor`` by default.
+        A mean difference below this is ignored; the parameter ``alarm_floor`` by default.
     parameters : mapping, optional
         Parameters of the monitor by name.
     progress : Progress
@@ -217,7 +217,7 @@ def validate(
     Raises
     ------
     RecordingError, InputError, DataError
-        The log cannot be read or holds nothing to judge by.
+        The log cannot be read or contains no data for the test.
     """
     curve, second, given = check_models(model, against, parameters or {})
     log = _not_empty(as_log(log, progress))
@@ -253,17 +253,17 @@ def check_models(
     model: Model | str | Path, against: Characteristic | str | Path | None,
     parameters: Mapping[str, Any],
 ) -> tuple[Model, Characteristic | None, dict[str, Any]]:  # fmt: skip
-    """Read the curves of a validation and refuse what does not go together.
+    """Read the curves of a validation and check that they can be used together.
 
-    The parameters are returned with the pressure exponent of the model.
+    The returned parameters contain the pressure exponent of the model.
 
     Raises
     ------
     RecordingError
         A file cannot be read.
     UsageError
-        An extended model judges rows freed of its causes, which another curve is not made
-        for; or the parameters name another pressure exponent.
+        ``against`` is given with an extended model, which is tested on rows after removing
+        its causes; or the parameters give another pressure exponent.
     """
     first = model if isinstance(model, Characteristic | ExtendedModel) else load_model(model)
     second = against
@@ -279,7 +279,7 @@ def check_models(
 
 
 def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
-    """Return a file's name, with its folder where that was named or two would read alike."""
+    """Return a file's name, with its folder if a folder was given or two names would be equal."""
     if isinstance(model, Characteristic | ExtendedModel):
         return getattr(model, 'model_id', '') or 'the model'
     file = model_path(Path(model))
@@ -291,9 +291,9 @@ def _see(
     log: Log, name: str, given: Mapping[str, Any], progress: Progress,
     shown: Callable[[float, str], None], model: ExtendedModel | None = None,
 ) -> tuple[Observed, Settings, tuple[str, ...]]:  # fmt: skip
-    """Run the engine over a log; return what it saw, its settings, and notes on the reading.
+    """Run the engine over a log; return the observed data, the settings, and notes on the reading.
 
-    An error says of which log it speaks.
+    An error message contains the name of the log.
     """
     settings, notes = settings_of(log, given, progress, constants=False)
     try:

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``diagnose``: what the simulation gets wrong, the cause, the gain."""
+"""``diagnose``: the difference between simulation and measurement, and its cause."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class DiagnosisResult(Result):
     Attributes
     ----------
     data : Diagnosed
-        Everything the report is made from.
+        All data of the report.
     form : StaticForm
-        Of the model.
+        Form of the model.
     on_top_of : ExtendedModel or None
-        The model whose causes were taken out of the rows before.
+        The model whose causes were removed from the rows first.
     """
 
     verb = 'diagnose'
@@ -60,12 +60,12 @@ class DiagnosisResult(Result):
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Return verdict, causes and gain."""
+        """Return the verdict, the causes and the gain."""
         return self.data.diagnosis
 
     @property
     def extended_model(self) -> ExtendedModel:
-        """Return the model extended by the causes that were found."""
+        """Return the model with the named causes added."""
         d = self.diagnosis
         return ExtendedModel(
             d.final, self.form, self.data.start_ns, d.reference, self.on_top_of, self.output_unit
@@ -94,9 +94,9 @@ class DiagnosisResult(Result):
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Aligned rows, special segments, and the model where one was found.
+    """Aligned rows, special segments, and the model if one was found.
 
-    The places are those of the rows among all of the log; None: they are all.
+    ``places`` are the indices of the rows among all rows of the log; None means all rows.
     """
 
     table: SampleTable
@@ -108,9 +108,9 @@ class _Rows:
     observed: Observed | None = None
 
     def asked(self, given: StaticForm) -> tuple[StaticForm, RegionalModel] | None:
-        """Return the form that the data ask for instead of the one given, and a model of it.
+        """Return the form that the data require instead of the given one, and a model of it.
 
-        None where they do not, or carry no model.
+        None if the given form fits, or if no model can be found.
         """
         if self.observed is None or not self.observed.contradicts(given):
             return None
@@ -122,12 +122,12 @@ class _Rows:
 
 
 def load_diagnosable(path: str | Path) -> Model:
-    """Return the model in a file, to hold a log against.
+    """Return the model in a file, with which a log is to be compared.
 
     Raises
     ------
     RecordingError, DataError
-        It cannot be read, or is a curve without dynamics.
+        The file cannot be read, or contains a curve without dynamics.
     """
     model = load_model(path)
     if isinstance(model, Characteristic) and not model.dynamics:
@@ -146,27 +146,27 @@ def diagnose(
     covariates: Mapping[str, str] | None = None,
     progress: Progress = SILENT,
 ) -> DiagnosisResult:
-    """Compare the simulation with the measured power and name the cause of what differs.
+    """Compare the simulation with the measured power and name the cause of the difference.
 
     Parameters
     ----------
     log : Log, str, Path or pandas.DataFrame
-        What `open_log` returned, or anything it opens.
+        The result of `open_log`, or anything that it opens.
     parameters : mapping, optional
         Parameters of the monitor by name.
     model : Characteristic, ExtendedModel or path, optional
-        What the log is held against; found in the log itself without it. The causes of an
-        extended model are taken out of the rows first, and what differs after that is found.
+        The log is compared with this model; by default a model is found in the log itself.
+        The causes of an extended model are removed from the rows before the comparison.
     covariates : mapping of str to str, optional
-        Columns (of a recording: topics) beside the signals that the power may follow, each
-        ``COLUMN`` or ``COLUMN:unit`` by the name to give it: ``{'vacuum':
-        'condenser_pressure_kpa'}``. Each is tried like a cause of the catalogue.
+        Further columns (of a recording: topics) that may influence the power, given as
+        ``COLUMN`` or ``COLUMN:unit`` by name: ``{'vacuum':
+        'condenser_pressure_kpa'}``. Each is tested like a cause of the catalogue.
     progress : Progress
 
     Raises
     ------
     DataError
-        The record cannot carry a diagnosis; the sentence says why.
+        The record does not permit a diagnosis; the message gives the reason.
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
@@ -226,7 +226,7 @@ def diagnose(
 
 
 def check_covariates(said: Mapping[str, str]) -> None:
-    """Refuse names of covariates that mean something else; raises `InputError`."""
+    """Raise `InputError` if the name of a covariate is invalid or already has another meaning."""
     for name in said:
         if not _NAME.fullmatch(name):
             raise InputError(
@@ -241,12 +241,12 @@ def check_covariates(said: Mapping[str, str]) -> None:
 def covariate_rows(
     log: Log, said: Mapping[str, str], table: SampleTable
 ) -> tuple[CovariateRows, ...]:
-    """Return covariates on the rows of a table.
+    """Return the covariates at the rows of a table.
 
     Raises
     ------
     InputError
-        A column is missing, or has a value for less than half of the rows.
+        A column is missing, or has values for fewer than half of the rows.
     """
     found = []
     for name, theirs in said.items():
@@ -269,7 +269,7 @@ _LEAST_SHARE = 0.5
 def _rows(
     log: Log, settings: Settings, wanted: bool, progress: Progress, earlier: ExtendedModel | None
 ) -> _Rows:
-    """Align the log and find special segments; go on without them where all signals are there."""
+    """Align the log and find special segments; continue without them if all signals are there."""
     try:
         observed = observe_log(log, settings, progress, earlier)
     except DataError as error:

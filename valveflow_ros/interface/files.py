@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Output files, whole or not there, and results: their files, report and main picture."""
+"""Output files, written completely or not at all, and results: files, report, main picture."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 TABLES = ('.csv', '.parquet')
 REPORT = 'report.html'
 FIGURES_FOLDER, TABLES_FOLDER = 'figures', 'tables'
-# Every verb that reads the recording of a monitor draws these, alike for one log.
+# Every verb that reads a monitor's recording draws these pictures; they are equal for one log.
 _DRAWN_BY_SEVERAL = ('history', 'alarms')
 
-# How a file of results tells which verb wrote it. The heads of our pages and files stand well
-# within so many bytes.
+# These patterns tell which verb wrote a result file. The first _HEAD bytes of our files contain
+# all that the patterns need.
 _HEAD = 4096
 _PAGE = re.compile(rb'<meta name="generator" content="valveflow ([a-z]+) ')
 _FORMAT = re.compile(rb'\A\{\s*"format":\s*"valveflow/([a-z_]+)"')
@@ -51,25 +51,25 @@ _TABLES = {
     ),
     'validate': re.compile(rb'\Asegment,kind,(\S*,)?curve\.'),
 }
-# The mark of a backup of a file that is not ours, or of a version that did not say.
+# Marks the backup of a file of another program or of a version that did not name its verb.
 _UNKNOWN = 'before'
 
 
 def reason(error: OSError) -> str:
-    """Return what the operating system said, as a part of a sentence."""
+    """Return the message of the operating system, to be used within a sentence."""
     return (error.strerror or str(error)).lower()
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a name beside ``path`` to write to; the file becomes ``path`` if all went well.
+    """Yield a temporary name in the folder of ``path``; it is renamed to ``path`` on success.
 
     Raises
     ------
     RecordingError
         The file cannot be written.
     """
-    # The suffix stays last: writers choose the format by it.
+    # The suffix must stay last because writers choose the format by it.
     draft = path.with_name(f'.{path.stem}.{os.getpid()}.draft{path.suffix}')
     try:
         yield draft
@@ -81,7 +81,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) -> dict[str, Path]:
-    """Write files of a folder, made if absent: all of them, or none is replaced.
+    """Write files into a folder, created if absent; if one fails, no file is replaced.
 
     Raises
     ------
@@ -109,12 +109,12 @@ def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) ->
 
 
 def write_log(table: SampleTable, path: Path, overwrite: bool = False) -> Path:
-    """Write rows as CSV, Parquet, MCAP or a recording's folder, by the suffix; return where.
+    """Write rows as CSV, Parquet, MCAP or a recording's folder, by the suffix; return the path.
 
     Raises
     ------
     RecordingError
-        It cannot be written, or is there already.
+        It cannot be written, or exists already.
     """
     from valveflow_ros.logs import write_samples, write_table
 
@@ -126,7 +126,7 @@ def write_log(table: SampleTable, path: Path, overwrite: bool = False) -> Path:
 
 
 def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict[Path, int]:
-    """Write what a monitor said in a recording, one table a kind; return the rows by file.
+    """Write the outputs of a recorded monitor, one table per kind; return the row count by file.
 
     Parameters
     ----------
@@ -137,9 +137,9 @@ def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict
     Raises
     ------
     DataError
-        The recording holds nothing of a monitor.
+        The recording contains no output of a monitor.
     RecordingError
-        A table cannot be written, or is there already.
+        A table cannot be written, or exists already.
     """
     from valveflow_ros.logs import outputs_in
     from valveflow_ros.logs import write_outputs as write_kind
@@ -155,12 +155,12 @@ def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict
 
 
 def is_empty(path: Path) -> bool:
-    """Return whether a file is there and holds nothing that could be lost."""
+    """Return True if the file exists and contains nothing that could be lost."""
     return path.is_file() and path.stat().st_size == 0
 
 
 def check_readable(path: Path, what: str) -> None:
-    """Raise `RecordingError` for a file that is not there; ``what`` says what cannot be done."""
+    """Raise `RecordingError` if a file does not exist; ``what`` names the impossible action."""
     try:
         path.stat()
     except OSError as error:
@@ -170,7 +170,7 @@ def check_readable(path: Path, what: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise `RecordingError` for a file that could not be written."""
+    """Raise `RecordingError` if a file could not be written."""
     folder = path.absolute().parent
     if path.is_dir():
         raise RecordingError(path, 'is a folder; name a file')
@@ -182,7 +182,7 @@ def check_writable(path: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise `RecordingError` for what cannot become a folder of results."""
+    """Raise `RecordingError` if a path cannot be used as a folder of results."""
     place = folder
     while not place.exists() and place != place.parent:
         place = place.parent
@@ -201,7 +201,7 @@ def check_output(
     Raises
     ------
     RecordingError
-        It is of an unknown kind, in no folder, equal to the input, or there already.
+        Its type is unknown, its folder does not exist, it is the input, or it exists already.
     """
     if path.suffix.lower() not in suffixes:
         raise RecordingError(path, f'must end in {" or ".join(suffixes)}')
@@ -223,7 +223,7 @@ def check_output(
 
 
 def check_log(path: Path, *, source: Path | None = None, overwrite: bool = False) -> None:
-    """Refuse a log as `check_output` does; a name without a suffix is a folder."""
+    """Check the path of a log with `check_output`; a name without a suffix is a folder."""
     if path.suffix:
         check_output(path, ('.mcap', *TABLES), source=source, overwrite=overwrite)
     elif path.exists() and (not path.is_dir() or any(path.iterdir())):
@@ -233,10 +233,10 @@ def check_log(path: Path, *, source: Path | None = None, overwrite: bool = False
 
 
 def _try_folder(folder: Path, advice: str) -> None:
-    """Write a byte into a folder, made if absent, and remove both again.
+    """Write a byte into a folder, created if absent, and remove both again.
 
-    Rights alone do not tell: a disk may be full, and not every place that root may write to
-    takes files.
+    To check the permissions is not enough: the disk may be full, and some places do not
+    accept files even from root.
     """
     absent = [place for place in (folder, *folder.parents) if not place.exists()]
     what = 'made' if absent else 'written into'
@@ -254,7 +254,7 @@ def _try_folder(folder: Path, advice: str) -> None:
 
 
 class Result:
-    """What a verb found: shown, drawn and written in the same way for all of them."""
+    """The result of a verb: all verbs show, draw and write their results in the same way."""
 
     verb: ClassVar[str]
 
@@ -268,7 +268,7 @@ class Result:
         raise NotImplementedError
 
     def texts(self) -> dict[str, str]:
-        """Return the files for programs by name; the first is the JSON of the result."""
+        """Return the files for programs as texts by name; the first is the result's JSON."""
         raise NotImplementedError
 
     def to_json(self) -> dict[str, Any]:
@@ -291,7 +291,7 @@ class Result:
         Parameters
         ----------
         name : str
-            One of the report's pictures; the main one by default.
+            Name of a picture of the report; the main one by default.
 
         Returns
         -------
@@ -304,7 +304,7 @@ class Result:
         """
         from valveflow_ros.report.page import plotly_script
 
-        plotly_script()  # a sentence where plotly is missing
+        plotly_script()  # raises a clear message if plotly is missing
         import plotly.graph_objects as go
 
         from valveflow_ros.report.drawing import palette
@@ -332,27 +332,27 @@ class Result:
         tables: bool = False,
         time_zone: str = '',
     ) -> WrittenFiles:
-        """Write the files of the result, then pictures and tables where they are wanted.
+        """Write the files of the result, and pictures and tables on request.
 
         Parameters
         ----------
         folder : str or Path
-            Made if absent. What another verb wrote under one of the names is kept under
-            another.
+            Created if absent. Files of the same names that another verb wrote are kept under
+            new names.
         figures : bool
             Also write each picture of the report as PNG and SVG, into ``figures``.
         tables : bool
-            Also write what each picture shows as CSV, into ``tables``.
+            Also write the data of each picture as CSV, into ``tables``.
         time_zone : str
-            In which the report tells times: ``Europe/Berlin``, ``+01:00``; UTC by default. Files
-            for programs have UTC.
+            Time zone of the report: ``Europe/Berlin``, ``+01:00``; UTC by default. Files
+            for programs always use UTC.
 
         Raises
         ------
         RecordingError
             The folder or a file cannot be written; then no file of the result is replaced.
         InputError
-            plotly is missing, or matplotlib and pictures are wanted; or the zone is not known.
+            plotly is not installed; or pictures are requested without matplotlib; or unknown zone.
         """
         from valveflow_ros.records import zone_of
 
@@ -397,16 +397,16 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class WrittenFiles:
-    """Where the files of a result are.
+    """The paths of the files of a result.
 
     Attributes
     ----------
     files : dict of str to Path
         By name.
     kept : mapping of str to str
-        Files that stood there, by old name, and the names they are kept under.
+        New names of the files that existed before, by old name.
     words : tuple of str
-        The same as sentences.
+        The same information as sentences.
     """
 
     files: dict[str, Path]
@@ -415,14 +415,14 @@ class WrittenFiles:
 
 
 def check_results(folder: Path, figures: bool, tables: bool) -> None:
-    """Refuse before long work what could not be written after it.
+    """Check before a long calculation that its results can be written.
 
     Raises
     ------
     InputError
-        plotly is not installed, or matplotlib where pictures are wanted.
+        plotly is not installed, or pictures are requested and matplotlib is not installed.
     RecordingError
-        A folder may not be written into.
+        A folder is not writable.
     """
     from valveflow_ros.report.page import plotly_script
 
@@ -438,15 +438,15 @@ def check_results(folder: Path, figures: bool, tables: bool) -> None:
 
 
 def signed(content: Mapping[str, Any], verb: str) -> dict[str, Any]:
-    """Return the content of an extended model with the verb that writes it, near its head.
+    """Return the content of an extended model with the name of its verb near the beginning.
 
-    Two verbs write one, and its format alone does not tell which.
+    Two verbs write extended models, and the format does not say which of them did.
     """
     return {'format': content['format'], 'written_by': verb, **content}
 
 
 def writer(path: Path) -> str:
-    """Return the verb that wrote a file, empty if that is not sure."""
+    """Return the verb that wrote a file, empty if unknown."""
     try:
         with path.open('rb') as file:
             head = file.read(_HEAD)
@@ -466,16 +466,16 @@ def writer(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """What another verb or somebody else had written, and where it stands now.
+    """Files that another verb or another program had written, and their new names.
 
     Attributes
     ----------
     names : mapping of str to str
-        Old names to new ones.
+        New names by old name.
     verb : str
-        Whose report was kept, empty if none was or that cannot be told.
+        The verb whose report was kept, empty if none was kept or the verb is unknown.
     old : str
-        An earlier report of the verb at work that stands beside the new one, or empty.
+        Name of an earlier report of the current verb beside the new one, or empty.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -483,7 +483,7 @@ class Backup:
     old: str = ''
 
     def words(self) -> str:
-        """Return one line for a person; empty if there is nothing to say."""
+        """Return one line for the user; empty if no file was renamed."""
         told = []
         for name, new in self.names.items():
             report = f'report of valveflow {self.verb}' if self.verb else 'report'
@@ -495,15 +495,15 @@ class Backup:
 
 
 def back_up(folder: Path, verb: str, names: Collection[str]) -> Backup:
-    """Copy the files that ``verb`` is about to replace and has not surely written itself.
+    """Copy the files that ``verb`` will replace, unless ``verb`` certainly wrote them itself.
 
     Raises
     ------
     RecordingError
-        A copy cannot be made; nothing has been replaced then.
+        A copy cannot be made; no file has been replaced.
     """
     kept: dict[str, str] = {}
-    # The report is named first.
+    # The message names the report first.
     for name in sorted(names, key=lambda n: n != REPORT):
         path = folder / name
         if not path.is_file() or (theirs := writer(path)) == verb:
@@ -522,7 +522,7 @@ def back_up(folder: Path, verb: str, names: Collection[str]) -> Backup:
 
 
 def _free_name(folder: Path, name: str, verb: str, taken: Collection[str]) -> str:
-    """Return a name for a copy: one that is free, or holds an older copy of the same verb."""
+    """Return a name for a copy: an unused one, or that of an older copy of the same verb."""
     mark = verb or _UNKNOWN
     new, number = _renamed(name, mark), 1
 
@@ -542,13 +542,13 @@ def _renamed(name: str, mark: str) -> str:
 
 
 def _painted(value: Any, colours: Mapping[str, str]) -> Any:
-    """Return a part of a picture with each ``token:name`` replaced by the colour's value."""
+    """Return a part of a picture with each ``token:name`` replaced by its colour value."""
     if isinstance(value, str):
         return colours[value[6:]] if value.startswith('token:') else value
     if isinstance(value, list):
         return [_painted(v, colours) for v in value]
     if isinstance(value, dict):
-        # A second, shorter title is for narrow pages only.
+        # The second, shorter title is used on narrow pages only.
         return {k: _painted(v, colours) for k, v in value.items() if k != 'short'}
     return value
 

@@ -61,10 +61,10 @@ class Identification(Result):
     Attributes
     ----------
     data : Identified
-        Everything the report is made from.
+        All data of the report.
     log : Log
     model : ExtendedModel or None
-        The model whose causes were held.
+        The model whose causes were kept fixed.
     """
 
     verb = 'identify'
@@ -84,12 +84,12 @@ class Identification(Result):
 
     @property
     def segments(self) -> tuple[SpecialSegment, ...]:
-        """Return the special segments that the curve was found in."""
+        """Return the special segments from which the curve was found."""
         return self.data.segments
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return sentences about how the data were read, and about the curve."""
+        """Return notes on how the data were read, and on the curve."""
         return (*self.data.notes, *self.characteristic.notes)
 
     @property
@@ -102,9 +102,9 @@ class Identification(Result):
         return identification_page(self.data)
 
     def texts(self) -> dict[str, str]:
-        """Return ``characteristic.json``, with a reference ``shift.json``, with a model its own.
+        """Return ``characteristic.json``; with a reference also ``shift.json``.
 
-        The extended model gets the new curve.
+        With a model also the extended model with the new curve.
         """
         c = self.characteristic
         contents = {'characteristic.json': to_json(c)}
@@ -135,22 +135,22 @@ def identify(
     Parameters
     ----------
     log : Log, str, Path or pandas.DataFrame
-        What `open_log` returned, or anything it opens.
+        The result of `open_log`, or anything that it opens.
     parameters : mapping, optional
         Parameters of the monitor by name, such as ``{'time_constant': 120}``.
     model : ExtendedModel or path, optional
-        An ``extended_model.json`` of a diagnosis: its causes are held, curve and dynamics
-        found anew.
+        An ``extended_model.json`` of a diagnosis: its causes are kept fixed, curve and dynamics
+        are identified again.
     reference : Characteristic or path, optional
-        A curve to judge the new one against.
+        A curve with which the new one is compared.
     step_test : bool
-        The log is a manual test: pressure constant, the opening in steps, each held.
+        The log is a manual test: constant pressure, and the opening changed in steps and held.
     progress : Progress
 
     Raises
     ------
     DataError
-        The data carry no curve, or none that can be compared with the reference.
+        The data determine no curve, or none that can be compared with the reference.
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
@@ -186,7 +186,7 @@ def _identified(
     settings, notes = settings_of(log, given, progress)
     try:
         observed = observe_log(log, settings, progress, model)
-        # Curves of another form could not be held against the reference, nor causes go with them.
+        # The form is kept: another one is not comparable with the reference, nor fits the causes.
         form = None if reference is None else reference.static_form
         form = form if model is None else model.form
         observed = replace(observed, task=replace(observed.task, form=form))
@@ -234,7 +234,7 @@ def _identified(
 
 
 def _rows_as_read(readings: Readings) -> SampleTable:
-    """Return a row for each time at which anything was read, nothing held or shifted."""
+    """Return a row for each time with any reading; values are neither held nor shifted."""
     times, row = np.unique(readings.time_ns, return_inverse=True)
     values = np.full((N_SIGNALS, len(times)), np.nan)
     good = readings.quality < Quality.BAD

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A log from a file or a DataFrame: readings in the engine's units, constants filled in."""
+"""A log from a file or a DataFrame: readings in the engine's units, with constants added."""
 
 from __future__ import annotations
 
@@ -56,30 +56,30 @@ from valveflow_ros.signals.units import (
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """A log that was read, and how it was understood.
+    """A log that was read, and its interpretation.
 
     Attributes
     ----------
     name : str
         Name of the file, or 'DataFrame'.
     contents : LogContents
-        As it stands in the file.
+        The log as in the file.
     readings : Readings
-        In engine units; constants stand at the times of another signal.
+        In engine units; constants have the times of another signal.
     units : dict
-        The unit each signal was taken to have, and each constant was given in.
+        The assumed unit of each signal, and the unit in which each constant was given.
     constants : dict
         Value of each constant signal, engine units.
     doubts : list of Doubt
-        Signals whose values do not suit their unit.
+        Signals whose values are implausible for their unit.
     compression : Compression, optional
-        How a historian kept the values, where it kept them by exception.
+        How a historian compressed the values, if it stored them by exception.
     updates : Readings, optional
-        What was read, where ``readings`` hold each value until the next one.
+        The values that were read, if ``readings`` repeat each value until the next one.
     source : object
-        What was opened, to read further columns from.
+        The file or DataFrame, to read further columns from it.
     mapping : LogMapping
-        How it was to be understood.
+        What the user specified about the log.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Log:
 
     @property
     def recorded(self) -> Readings:
-        """Return the values that stand in the log itself, none held."""
+        """Return the values in the log itself, without repeated ones."""
         return self.readings if self.updates is None else self.updates
 
     @property
@@ -105,7 +105,7 @@ class Log:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return sentences about how the file was read."""
+        """Return notes on how the file was read."""
         kept = () if self.compression is None else (self.compression.sentence,)
         return (*self.contents.warnings, *(d.sentence for d in self.doubts), *kept)
 
@@ -116,15 +116,15 @@ class Log:
         return engine_unit(Signal.GENERATED_POWER, unit)
 
     def parameters(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-        """Return what is given and what follows from the units of the log, and sentences on that.
+        """Return the given parameters with those that follow from the log's units, and notes.
 
-        Parameters that are in MW are for a unit of some 300 MW; where the output is a flow they
-        are for one of its size. The unit of the output is always the log's.
+        The defaults in MW suit a unit of about 300 MW; if the output is a flow they are scaled
+        to its size. The unit of the output is always that of the log.
 
         Raises
         ------
         InputError
-            Another unit of a flow is given.
+            The given parameters name another unit of the flow.
         """
         found: dict[str, Any] = {**limits_beside_steam(self.units, self.constants)}
         told: list[str] = []
@@ -168,23 +168,23 @@ class Log:
         return {**found, **given, **units}, told
 
     def name_of(self, signal: Signal) -> str:
-        """Return the topic or column a signal comes from, empty if it is not there."""
+        """Return the topic or column of a signal, empty if the log does not contain the signal."""
         return '' if signal in self.constants else self.contents.signals.get(signal, '')
 
     def steps(self) -> dict[Signal, float]:
-        """Return the median time between readings of each signal that has several, in s."""
+        """Return the median time between readings in s, for each signal with several readings."""
         return steps_of(self.readings.by_signal())
 
     def to_dataframe(self) -> Any:
-        """Return the readings as a table: one row for each time at which anything was read.
+        """Return the readings as a table with one row for each time with any reading.
 
         Returns
         -------
         pandas.DataFrame
             ``time`` (UTC) and a float64 column for each signal, in the engine's units and
-            with its name (``valve_opening_percent``, ...). NaN where a signal was not read
-            or its value is bad; of several values of one time the last. A column
-            ``..._quality`` stands beside a signal with uncertain values.
+            with its name (``valve_opening_percent``, ...). A value is NaN if the signal was not
+            read or its value is bad; of several values at one time the last is used. A
+            signal with uncertain values also has a column ``..._quality``.
         """
         import pandas as pd
 
@@ -218,7 +218,7 @@ def open_log(
     period: str = '',
     progress: Progress = SILENT,
 ) -> Log:
-    """Open a log, convert it, and report what looks wrong.
+    """Open a log, convert its units, and report implausible values.
 
     Parameters
     ----------
@@ -227,16 +227,16 @@ def open_log(
         a DataFrame with a column ``time`` (datetimes, those without a zone in UTC; ISO 8601
         texts; or Unix seconds) and columns such as ``valve_opening_percent``.
     mapping : LogMapping, optional
-        All of the following in one.
+        All of the following in one object.
     columns : mapping of str to str, optional
-        What a signal is called in the log and its unit: ``{'main_steam_pressure':
-        'PT_100:bar'}``. Columns of a table that say what they hold are found without it.
+        Name of a signal in the log and its unit: ``{'main_steam_pressure':
+        'PT_100:bar'}``. Columns of a table with a recognisable name need not be given.
     constants : mapping, optional
         Signals that were not logged: ``{'main_steam_temperature': 540}``.
     time_zone, date_order, decimal, sheet : str
-        How a table is written, where it does not show that itself.
+        Format of a table, if it cannot be recognised from the table itself.
     max_unpacked : str
-        Megabytes to which a workbook or a Parquet file may unpack.
+        Largest unpacked size of a workbook or a Parquet file, in megabytes.
     period : str
         Time from one row to the next of a table without times: ``60s``, ``1min``.
     progress : Progress
@@ -244,7 +244,7 @@ def open_log(
     Raises
     ------
     RecordingError, InputError, DataError
-        The log cannot be read, a column is missing, a unit unknown.
+        The log cannot be read, a column is missing, or a unit is unknown.
     """
     if mapping is None:
         table = {'time_zone': time_zone, 'date_order': date_order, 'decimal': decimal,
@@ -277,25 +277,25 @@ def open_log(
 
 
 def read_covariate(log: Log, name: str, said: str) -> Series:
-    """Read a column beside the signals: as it stands in the log, without limits.
+    """Read a further column of a log, without conversion of units and without limits.
 
     Parameters
     ----------
     log : Log
         From `open_log`.
     name : str
-        What the covariate is called in sentences.
+        Name of the covariate in messages.
     said : str
         ``COLUMN`` or ``COLUMN:unit``; of a recording a topic of Float64.
 
     Raises
     ------
     InputError
-        There is no such column, or it holds no number.
+        There is no such column, or it contains no number.
     """
     theirs, colon, told = said.rpartition(':')
     contents = _column_of(log, theirs.strip()) if colon and theirs else None
-    if contents is None:  # a column's name may itself hold a colon
+    if contents is None:  # a column's name may itself contain a colon
         theirs, told = said, ''
         contents = _column_of(log, theirs.strip())
     if contents is None:
@@ -311,12 +311,12 @@ def read_covariate(log: Log, name: str, said: str) -> Series:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A column beside the signals.
+    """A further column of a log.
 
     Attributes
     ----------
     column, unit : str
-        Its name in the log; its unit, '' where not known.
+        Its name in the log; its unit, '' if unknown.
     time_ns : int64 (k,)
         Not decreasing.
     values : float64 (k,)
@@ -329,9 +329,9 @@ class Series:
     values: FloatArray
 
     def at(self, time_ns: IntArray) -> FloatArray:
-        """Return the values at other times, on straight lines; NaN in gaps and at the ends.
+        """Return the values at other times by linear interpolation; NaN in gaps and outside.
 
-        A gap is longer than an hour and than five times the usual step.
+        A gap is longer than one hour and longer than five times the median step.
         """
         seconds = (self.time_ns - time_ns[0]) / 1e9
         rows = (time_ns - time_ns[0]) / 1e9
@@ -349,16 +349,16 @@ class Series:
         return out
 
 
-# Flow goes as the root of the pressure difference, the limits of a flow are so many times what it
-# is at full flow, and parameters in MW are for a unit of this size.
+# The flow is proportional to the root of the pressure difference; limit of a flow, as multiple of
+# the full flow; quantile that defines full flow; size of unit that the parameters in MW suit.
 _OF_DIFFERENCE, _MOST, _FULL, _USUAL_MW = 0.5, 10.0, 0.995, 300.0
 _GAP_S, _GAP_STEPS = 3600.0, 5.0
-# A reader gives numbers for signals only: the column is read in place of one, before units.
+# Readers return signals only: the column is read as this signal, before units are converted.
 _READ_AS = Signal.VALVE_COMMAND
 
 
 def _column_of(log: Log, theirs: str) -> LogContents | None:
-    """Return the log with a column in place of a signal; None where there is none."""
+    """Return the log with the column read as a signal; None if there is no such column."""
     topics = [info.topic for info in SIGNALS]
     times = {k: v for k, v in log.mapping.names().items() if k not in topics}
     names = {**times, SIGNALS[_READ_AS].topic: theirs}
@@ -384,7 +384,7 @@ _COVARIATE_UNITS = {
 
 
 def as_log(log: Any, progress: Progress) -> Log:
-    """Return a log as it is, or open what stands for one."""
+    """Return a log unchanged, or open it from a file or a DataFrame."""
     return log if isinstance(log, Log) else open_log(log, progress=progress)
 
 
@@ -450,11 +450,11 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
 
 
 def _units_told(contents: LogContents) -> dict[Signal, str]:
-    """Return the units that a log names itself.
+    """Return the units that the log itself contains.
 
-    The columns of a table may name them. What was imported stands in the engine's units, and
-    names those that are not the contract's. A monitor records what the gateway sent, as it was
-    sent, and its own parameters beside it; stamped samples carry the units of the contract.
+    The columns of a table may name them. An imported log lists its units in an attachment.
+    A monitor records the values in the gateway's units, and its own parameters, which name
+    these units; stamped samples always use the default units.
     """
     if contents.units:
         return dict(contents.units)
@@ -530,7 +530,7 @@ def _nanoseconds(times: Any) -> tuple[IntArray, Any]:
     if pd.api.types.is_numeric_dtype(series):
         seconds = series.to_numpy(np.float64)
         there = np.isfinite(seconds)
-        # Whole seconds apart: a float64 of ns would round them.
+        # Whole seconds are converted separately: a float64 of ns would round them.
         whole = np.floor(np.where(there, seconds, 0.0))
         part = np.round((np.where(there, seconds, 0.0) - whole) * 1e9).astype(np.int64)
         return whole.astype(np.int64) * 1_000_000_000 + part, there

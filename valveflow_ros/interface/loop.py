@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``loop``: the valve of one control loop judged from its command and what follows it."""
+"""``loop``: test the valve of one control loop from its command and its position or process."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from valveflow_ros.logs.tables.times import NEVER
 from valveflow_ros.records import FloatArray
 
 FILE = 'loop.json'
-# Rows on a grid of the usual step; beyond so many the table has one long gap.
+# Largest ratio of grid rows to table rows; above it long gaps are shortened.
 _MOST_GRID = 4
 
 
 @dataclass(frozen=True, slots=True)
 class LoopResult:
-    """What a record says of the valve of its loop.
+    """The result for the valve of a control loop.
 
     Attributes
     ----------
     judgement : LoopJudgement
-        Verdict, reason, sizes, and what each test says.
+        Verdict, reason, sizes, and the result of each test.
     names : dict of str to str
         The columns by role: command, position or process, set_point.
     time_s : float64 (n,)
-        Since the first row, equally far apart.
+        Time since the first row, equally spaced.
     columns : dict of str to float64 (n,)
-        By role; NaN where a row is missing.
+        Values by role; NaN if a row is missing.
     """
 
     judgement: LoopJudgement
@@ -77,7 +77,7 @@ class LoopResult:
         }
 
     def write(self, folder: str | Path) -> Path:
-        """Write ``loop.json`` into a folder, made if absent; return where it is.
+        """Write ``loop.json`` into a folder, created if absent; return its path.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class LoopResult:
         return write_texts(Path(folder), {FILE: text})[FILE]
 
     def plot(self) -> Any:
-        """Return command and what follows it as a plotly figure.
+        """Return the command and the position or process value as a plotly figure.
 
         Raises
         ------
@@ -97,7 +97,7 @@ class LoopResult:
         """
         from valveflow_ros.report.page import plotly_script
 
-        plotly_script()  # a sentence where plotly is missing
+        plotly_script()  # raises a clear message if plotly is missing
         import plotly.graph_objects as go
 
         figure = go.Figure(layout={'title': self.judgement.reason, 'template': 'plotly_white'})
@@ -119,7 +119,7 @@ def judge_loop(
     options: TableOptions | None = None,
     progress: Progress = SILENT,
 ) -> LoopResult:
-    """Judge the valve of one control loop: sticks, has slack, is sound, or cannot be judged.
+    """Test the valve of one control loop: stiction, backlash, sound, or not known.
 
     Parameters
     ----------
@@ -129,13 +129,13 @@ def judge_loop(
     command : str
         Column of the controller's output in %.
     position : str
-        Column of the measured position in %; with it sizes are told.
+        Column of the measured position in %; with it the sizes of the faults are estimated.
     process : str
         Column of the process variable, in any unit; needed without a position.
     set_point, time : str
-        Columns. What is not named is found by its name: MV or OP, PV, SP or SV.
+        Columns. Columns that are not given are found by their names: MV or OP, PV, SP or SV.
     options : TableOptions, optional
-        How a table is written, where it does not show that itself.
+        Format of a table, if it cannot be recognised from the table itself.
     progress : Progress
 
     Raises
@@ -173,14 +173,14 @@ def _known(value: float) -> float | None:
 
 
 def _gridded(read: LoopColumns) -> tuple[float, dict[str, FloatArray]]:
-    """Return the usual step in s and the columns on rows of that step, NaN where none was."""
+    """Return the median step in s and the columns on a grid of that step, NaN in missing rows."""
     times = read.time_ns
     if len(times) < 2:
         return 1.0, read.columns
     step = float(np.median(np.diff(times)))
     rows = np.rint((times - times[0]) / step).astype(np.int64)
     if rows[-1] > _MOST_GRID * len(rows):
-        # Long pauses become short ones: a stretch ends at either.
+        # Shorten long gaps; a gap of any length ends a stretch of data.
         rows = np.concatenate(([0], np.cumsum(np.minimum(np.diff(rows), 10))))
     rows, first = np.unique(rows, return_index=True)
     out = {}

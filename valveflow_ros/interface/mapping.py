@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a person says of a log: names, units, constants, and how a table is written."""
+"""What the user specifies about a log: names, units, constants, and the format of a table."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TIMES = ('time', 'date')
 _BY_NAME = {name: info for info in SIGNALS for name in (info.topic, info.column)}
 _TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',
           'sheet': 'sheet', 'max-unpacked': 'max_unpacked', 'period': 'period'}  # fmt: skip
-# Stands in for a signal that nobody has named yet, to find what else a table leaves open.
+# Placeholder for a signal that is not named yet, used to find all further open questions.
 _STAND_IN = {
     'valve_opening': 50.0,
     'main_steam_pressure': 15.0,
@@ -38,7 +38,7 @@ _STAND_IN = {
     'valve_command': 50.0,
 }
 _MOST_LOOKS = 12
-# Each further look may read the whole table.
+# Progress message, because each further attempt may read the whole table.
 LOOKING_ON = 'looking for what else the table leaves open'
 
 
@@ -51,11 +51,11 @@ class Column:
     name : str
         The topic's name of a signal, or 'time' or 'date'.
     theirs : str
-        What it is called in the log.
+        Its name in the log.
     unit : str
         As written; empty means the engine's own unit.
     whole : str
-        Everything after the equals sign: a column's name may itself hold a colon.
+        Everything after the equals sign: a column's name may itself contain a colon.
     """
 
     name: str
@@ -65,15 +65,15 @@ class Column:
 
     @property
     def known(self) -> bool:
-        """Return whether the unit is one of the signal's, or none was given."""
+        """Return True if the unit is valid for the signal, or none was given."""
         return not self.unit or self.unit in known_units(_BY_NAME[self.name].signal)
 
 
 @dataclass(frozen=True, slots=True)
 class LogMapping:
-    """Columns and constants by the topic's name.
+    """Columns and constants by topic name.
 
-    Constants are in the engine's units; ``units`` are those in which they were written.
+    Constants are in the engine's units; ``units`` are the units given by the user.
     """
 
     columns: dict[str, Column] = field(default_factory=dict)
@@ -83,7 +83,7 @@ class LogMapping:
 
     @property
     def constant_units(self) -> dict[Signal, str]:
-        """Return the units the constants were given in, by signal."""
+        """Return the units in which the constants were given, by signal."""
         return {_BY_NAME[name].signal: unit for name, unit in self.units.items()}
 
     @property
@@ -94,13 +94,13 @@ class LogMapping:
     def names(self) -> dict[str, str]:
         """Return the name in the log of each column that was named.
 
-        Where what follows the last colon is no unit, the colon is taken to belong to the
+        If the text after the last colon is no unit, the colon is taken as a part of the
         column's name.
         """
         return {c.name: c.theirs if c.known else c.whole for c in self.columns.values()}
 
     def open_with(self, look: Callable[[dict[str, str]], Answer]) -> Answer:
-        """Return what ``look`` gives for these names; an unknown unit explains a failure.
+        """Return ``look(names)``; if it fails and a unit is unknown, the message names that unit.
 
         Raises
         ------
@@ -120,10 +120,10 @@ class LogMapping:
             ) from error
 
     def unit_of(self, signal: Signal, told: dict[Signal, str]) -> str:
-        """Return the unit a signal is taken to have.
+        """Return the assumed unit of a signal.
 
-        What the person says stands above what the log says of itself (``told``), and that
-        above the unit of the contract.
+        The user's unit has precedence over the unit that the log contains (``told``), and
+        that over the default unit.
         """
         info = SIGNALS[signal]
         column = self.columns.get(info.topic)
@@ -133,7 +133,7 @@ class LogMapping:
 
 
 def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str) -> LogMapping:
-    """Read what a person says of a log.
+    """Read the user's specification of a log.
 
     Parameters
     ----------
@@ -142,13 +142,13 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str)
     constants : sequence of str
         Each ``NAME=VALUE[:UNIT]``.
     **table : str
-        Of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``, ``max_unpacked``,
+        Format of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``, ``max_unpacked``,
         ``period``.
 
     Raises
     ------
     UsageError
-        Something is not of the right form, given twice, or contradictory.
+        An option has a wrong form, is given twice, or contradicts another.
     """
     found = LogMapping(table=table_options(table))
     for text in columns:
@@ -217,14 +217,14 @@ def _split(option: str, text: str) -> tuple[str, str]:
 
 
 def _unit(signal: Signal, text: str) -> str:
-    """Return the project's name of a unit, the text itself if it spells none."""
+    """Return the canonical name of a unit, or the text itself if it is no known unit."""
     written = text.strip()
     known = {spelling.lower(): spelling for spelling in known_units(signal)}
     return known.get(written.lower()) or unit_named(signal, written) or written
 
 
 def _signal(name: str, option: str) -> Signal:
-    """Return the signal of a topic's or a column's name."""
+    """Return the signal with this topic name or column name."""
     if name in _BY_NAME:
         return _BY_NAME[name].signal
     known = [info.topic for info in SIGNALS] + (list(_TIMES) if option == 'column' else [])
@@ -240,15 +240,15 @@ def gather_refusals(
     mapping: LogMapping,
     again: Callable[[LogMapping], object],
 ) -> Answer:
-    """Return what a look at a table gives; gather everything that the table leaves open.
+    """Return the result of ``look``; if it is refused, collect all open questions of the table.
 
-    Where ``look`` is refused, ``again`` looks on as if the person had answered, so that all
-    questions are asked at once.
+    If ``look`` is refused, ``again`` continues as if the user had answered, so that one message
+    contains all questions.
 
     Raises
     ------
     RefusedError
-        With everything that would have been refused, one after the other.
+        Contains all refusals that would otherwise have come one after another.
     """
     try:
         return look(mapping)
@@ -268,15 +268,15 @@ def gather_refusals(
             found.append(refused)
             remedies += refused.remedies
         except ValveflowError:
-            # What was open before has to be said first.
+            # The earlier questions come first.
             break
-    # Of two options about one thing the later one counts.
+    # A later option overrides an earlier one for the same subject.
     newest = list({subject(remedy): remedy for remedy in remedies}.values())
     raise merge_refusals(path, found, newest) from None
 
 
 def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
-    """Return the mapping with these options added; what is not known yet is left out."""
+    """Return the mapping with these options added; options without a value yet are left out."""
     columns, constants, table = dict(mapping.columns), dict(mapping.constants), mapping.table
     for remedy in remedies:
         if remedy.option in _TABLE:
@@ -296,7 +296,7 @@ def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
 def merge_refusals(
     path: object, refused: Sequence[RefusedError], remedies: Sequence[Remedy] | None = None
 ) -> RefusedError:
-    """Return one refusal that says what all of these say."""
+    """Return one refusal with the messages of all of these."""
     problems = []
     for one in refused:
         about = one.where.removeprefix(str(path)).lstrip(': ')
@@ -306,5 +306,5 @@ def merge_refusals(
 
 
 def subject(remedy: Remedy) -> str:
-    """Return what an option speaks of: a second one takes the place of the first."""
+    """Return the subject of an option: a later option with the same subject replaces it."""
     return remedy.value.partition('=')[0].strip() if remedy.option == 'column' else remedy.option

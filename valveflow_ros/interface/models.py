@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Reads ``characteristic.json``, ``extended_model.json`` and the truth of a simulated plant."""
+"""Read ``characteristic.json``, ``extended_model.json`` and the truth of a simulated plant."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def load_characteristic(path: str | Path) -> Characteristic:
     Parameters
     ----------
     path : str or Path
-        A ``characteristic.json``, or the folder that holds one.
+        A ``characteristic.json``, or the folder that contains one.
 
     Raises
     ------
     RecordingError
-        It cannot be read, or is no characteristic this version can read.
+        It cannot be read, or is no characteristic that this version supports.
     """
     model = load_model(path)
     if not isinstance(model, Characteristic):
@@ -50,7 +50,7 @@ def load_extended(path: str | Path) -> ExtendedModel:
 
 
 def load_model(path: str | Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Model:
-    """Return what a file holds, a characteristic or an extended model.
+    """Return the characteristic or the extended model in a file.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def load_model(path: str | Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -
     Raises
     ------
     RecordingError
-        It cannot be read, or is none this version can use.
+        It cannot be read, or is no model that this version supports.
     """
     path = model_path(Path(path), names)
     raw = _read_json(path, 'a flow characteristic', 'flow characteristic')
@@ -75,19 +75,19 @@ def load_model(path: str | Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -
 
 
 def model_path(path: Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Path:
-    """Return the file that is meant: of a folder, the first of ``names`` in it."""
+    """Return the path of the file; for a folder, the first of ``names`` in it."""
     if not path.is_dir():
         return path
     return next((path / name for name in names if (path / name).is_file()), path)
 
 
 def with_exponent(model: Model, given: Mapping[str, Any], name: object) -> dict[str, Any]:
-    """Return parameters with the pressure exponent of a model; one over the opening has none.
+    """Return parameters with the pressure exponent of a model, unless its axis is the opening.
 
     Raises
     ------
     UsageError
-        Another exponent is given; ``name`` is what the sentence calls the model.
+        Another exponent is given; ``name`` is the name of the model in the message.
     """
     if model.pressure_exponent == 0.0:
         return dict(given)
@@ -101,12 +101,12 @@ def with_exponent(model: Model, given: Mapping[str, Any], name: object) -> dict[
 
 
 def check_output(model: Model, unit: str, name: object) -> None:
-    """Refuse a model whose output is in another unit than the one of the log.
+    """Check that the output of a model has the same unit as that of the log.
 
     Raises
     ------
     UsageError
-        ``name`` is what the sentence calls the model.
+        The units differ; ``name`` is the name of the model in the message.
     """
     if model.output_unit != unit:
         raise UsageError(

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``monitor``: what the monitor tells over a log; and what one has told, from its recording."""
+"""``monitor``: run the monitor over a log, and read the outputs of a recorded monitor."""
 
 from __future__ import annotations
 
@@ -58,25 +58,25 @@ from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
 from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment, signed
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 
-# Without diagnoses; each takes as long as `diagnose` over the window.
+# Switches the diagnoses off: each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
 
 
 @dataclass(frozen=True, slots=True)
 class MonitorResult(Result):
-    """What a monitor tells over a log.
+    """The outputs of a monitor over a log.
 
     Attributes
     ----------
     source : str
         Name of the log.
     events : tuple of Event
-        Everything the engine said, in order.
+        All events of the engine, in order.
     start_ns, end_ns : int
         First and last row.
     settings : Settings
     wear : Wear or None
-        How the curve changed slowly; None while that is not known.
+        The slow change of the curve; None while it is unknown.
     """
 
     verb = 'monitor'
@@ -89,12 +89,12 @@ class MonitorResult(Result):
 
     @property
     def output_unit(self) -> str:
-        """Return what the output is measured in."""
+        """Return the unit of the output."""
         return self.settings.output_unit
 
     @property
     def wear_words(self) -> str:
-        """Say how the curve has changed slowly; empty while that is not known."""
+        """Return a sentence on the slow change of the curve; empty while it is unknown."""
         if self.wear is None:
             return ''
         since, unit = moment(self.wear.since_ns), self.output_unit
@@ -105,7 +105,7 @@ class MonitorResult(Result):
 
     @property
     def reference_words(self) -> str:
-        """Say which curve is the reference, or why none is."""
+        """Return a sentence on which curve is the reference, or why there is none."""
         curve = next(
             (e.characteristic for e in reversed(self.events) if isinstance(e, ReferenceSet)), None
         )
@@ -123,7 +123,7 @@ class MonitorResult(Result):
 
     @property
     def curves(self) -> list[tuple[int, Characteristic]]:
-        """Return each curve with the time (ns) of the row after which it was adopted."""
+        """Return each curve with the time (ns) of the last row before its adoption."""
         adopted = [e.characteristic for e in self.events if isinstance(e, CurveAdopted)]
         times = [
             e.time_ns
@@ -134,7 +134,7 @@ class MonitorResult(Result):
 
     @property
     def alarms(self) -> list[AlarmChange]:
-        """Return the changes of the alarms' states, without mere repetitions."""
+        """Return the changes of the alarms' states, without repetitions."""
         return [c for c in self._alarm_changes if c.state != c.previous]
 
     @property
@@ -143,7 +143,7 @@ class MonitorResult(Result):
 
     @property
     def diagnoses(self) -> list[tuple[int, dict[str, Any]]]:
-        """Return each diagnosis: the newest row (ns) it saw, and what its JSON would hold."""
+        """Return each diagnosis: the time (ns) of its newest row, and the content of its JSON."""
         ended = [e for e in self.events if isinstance(e, Diagnosed) and e.content]
         return [(e.task.window_end_ns, json.loads(e.content)) for e in ended]
 
@@ -168,7 +168,7 @@ class MonitorResult(Result):
         )
 
     def page(self) -> Page:
-        """Return the report: how the curve moved, and what the monitor said."""
+        """Return the report: the changes of the curve, and the outputs of the monitor."""
         lead = paragraph(text(self.source), 'where')
         lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
         lead += paragraph(text(f'{self.reference_words} {self.wear_words}'), 'where')
@@ -180,7 +180,7 @@ class MonitorResult(Result):
         return Page('What the monitor would have told', lead, sections, foot, self.verb)
 
     def _answer(self) -> list[str | Figure]:
-        """Return what stands at the end, why as far as it is known, and every diagnosis."""
+        """Return the state at the end, its reasons as far as known, and every diagnosis."""
         alarms, curves = self._alarms_json(), len(self.curves)
         standing = [a for a in alarms if a['cleared'] is None]
         parts: list[str | Figure] = [
@@ -204,7 +204,7 @@ class MonitorResult(Result):
 
     @property
     def advice(self) -> list[str]:
-        """Return what each named cause means in MW and what to do, as it was found last."""
+        """Return each named cause's effect in MW and its advice, from the latest diagnosis."""
         named = {c['name']: c for _, d in self.diagnoses for c in d['causes']}
         told = [advice(name, c['meaning'], c['to_do']) for name, c in named.items()]
         return [words for words in told if words]
@@ -246,11 +246,11 @@ class MonitorResult(Result):
         ]
         if not references:
             return None
-        # One that is set before the first row has no time of its own.
+        # An alarm that is set before the first row has no time.
         return {'set': max(times[-1], self.start_ns), 'model_id': references[-1].model_id}
 
     def _alarms_json(self) -> list[dict[str, Any]]:
-        """Return one entry for each time that an alarm rose, with what was told of it last."""
+        """Return one entry for each rise of an alarm, with the last report on it."""
         found: dict[tuple[str, int], dict[str, Any]] = {}
         for change in self._alarm_changes:
             stands = change.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
@@ -278,27 +278,27 @@ def monitor(
     diagnose: bool = True,
     progress: Progress = SILENT,
 ) -> MonitorResult:
-    """Run the monitor over a log, as fast as it goes, with every fit computed in place.
+    """Run the monitor over a log as fast as possible; each fit is computed in this process.
 
     Parameters
     ----------
     log : Log, str, Path or pandas.DataFrame
-        What `open_log` returned, or anything it opens.
+        The result of `open_log`, or anything that it opens.
     parameters : mapping, optional
-        Parameters of the monitor by name. What follows from the step of the data is adapted.
+        Parameters of the monitor by name. Those that depend on the step of the data are adapted.
     model : ExtendedModel or path, optional
-        An ``extended_model.json`` whose causes are taken out of the rows first, as the
-        parameter ``model_file`` of the node names one.
+        An ``extended_model.json`` whose causes are removed from the rows first, like the
+        parameter ``model_file`` of the node.
     reference : Characteristic or path, optional
-        Every curve is judged against it, as ``reference_file`` of the node.
+        Every curve is compared with it, like the parameter ``reference_file`` of the node.
     diagnose : bool
-        Also compute the diagnoses that the monitor asks for; each takes as long as `diagnose`.
+        Also compute the diagnoses that the monitor requests; each takes as long as `diagnose`.
     progress : Progress
 
     Raises
     ------
     DataError
-        A needed signal has no usable value.
+        A required signal has no usable value.
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
@@ -312,7 +312,7 @@ def monitor(
     if reference is not None and not isinstance(reference, Characteristic):
         reference = load_characteristic(reference)
     log = as_log(log, progress)
-    # The window stays as long as that of a live monitor, however long the log is.
+    # The window is as long as that of a live monitor, independent of the length of the log.
     given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
     for sentence in (*told, *notes):
@@ -341,10 +341,10 @@ def _curve_moment(time_ns: int, c: Characteristic) -> CurveMoment:
 
 
 def recorded_history(log: LogContents) -> History | None:
-    """Return what a monitor published; None if the log is no monitor's recording.
+    """Return the outputs of a monitor; None if the log is no monitor's recording.
 
-    Topics are taken by their type: the node may have any name. What cannot be decoded
-    becomes a sentence among the notes.
+    Topics are found by their type because the node may have any name. A message that
+    cannot be decoded is reported in the notes.
     """
     notes: list[str] = []
     told = [m for kind in (CURVE, ALARM, DIAGNOSIS) for m in _all(log, kind, notes)]
@@ -354,7 +354,7 @@ def recorded_history(log: LogContents) -> History | None:
 
 
 def _all(log: LogContents, kind: str, notes: list[str]) -> list[Moment]:
-    """Return what the messages of one type say; of several topics only the first is taken."""
+    """Return the messages of one type; of several topics only the first is used."""
     topics = sorted(t.name for t in log.topics.values() if t.type == kind and t.count)
     if not topics:
         return []

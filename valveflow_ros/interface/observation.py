@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run the engine over a finished log: align, find special segments, ask for one fit."""
+"""Run the engine over a finished log: align, find special segments, request one fit."""
 
 from __future__ import annotations
 
@@ -48,20 +48,20 @@ LEARN_SHARE = 2.0 / 3.0
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """A log after the engine saw it, and what is needed for a fit.
+    """A log processed by the engine, and the inputs of a fit.
 
     Attributes
     ----------
     table : SampleTable
-        The rows in the engine's window; where the clock went back without those it had passed.
+        The rows in the engine's window; if the clock was set back, without the rows before that.
     rows : int64 (n,)
-        Their places among all rows of the log.
+        Their indices among all rows of the log.
     segments : tuple of SpecialSegment
     counts : dict
         ``{topic: {reason: readings}}``.
     task : FitTask
     clock_resets : int
-        How often the clock went back.
+        Number of times the clock was set back.
     """
 
     table: SampleTable
@@ -72,7 +72,7 @@ class Observed:
     clock_resets: int
 
     def fit(self, progress: Callable[[float, str], None] = SILENT) -> Characteristic:
-        """Return the curve; raises `DataError` with the reason if the data carry none."""
+        """Return the curve; raise `DataError` with the reason if the data determine none."""
         return fit(self.task, lambda what: progress(0.6, what))
 
     @property
@@ -81,16 +81,16 @@ class Observed:
         return StaticForm(exponent=self.task.settings.real('pressure_exponent'))
 
     def contradicts(self, given: StaticForm) -> bool:
-        """Return whether the data tell that the static power has another form."""
+        """Return True if the data show that the static power has another form."""
         return form_contradicted(self.task, given)
 
     def outline(
         self, progress: Callable[[float, str], None] = SILENT
     ) -> tuple[RegionalModel, StaticForm]:
-        """Return curve and dynamics to begin a diagnosis with; raises `DataError` as `fit`.
+        """Return curve and dynamics as start of a diagnosis; raises `DataError` like `fit`.
 
-        Where the data do not ask for knees at fixed openings the form is the paper's with the
-        exponent of the settings: another one is a cause, and is to be named.
+        Unless the data require breakpoints at fixed openings, the form is the paper's with the
+        exponent of the settings: another exponent is a cause, which the diagnosis must name.
         """
         scaled = form_of_data(self.task).scaled
         task = self.task if scaled else replace(self.task, form=self.paper_form)
@@ -105,7 +105,7 @@ def settings_of(
     Raises
     ------
     ParameterError
-        Values are at odds with each other.
+        Values contradict each other.
     """
     given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), log.span_s, given, held=log.updates is not None)
@@ -126,14 +126,14 @@ def observe(
     progress: Callable[[float, str], None] = SILENT,
     corrector: Corrector | None = None,
 ) -> Observed:
-    """Feed readings to a monitor and ask it for a fit.
+    """Feed readings to a monitor and request a fit.
 
-    With a ``corrector`` everything sees the rows freed of its causes.
+    With a ``corrector`` its causes are removed from the rows before all other steps.
 
     Raises
     ------
     DataError
-        There is nothing that could be fitted; the sentence says what is missing.
+        The data do not suffice for a fit; the message says what is missing.
     """
     aligner, monitor = Aligner(settings), Monitor(settings)
     tables: list[SampleTable] = []
@@ -148,7 +148,7 @@ def observe(
     if not monitor.segments:
         raise DataError(_no_segment(table, settings, monitor.noise().learnt))
     task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    # A log longer than the window is longer than what the fit sees.
+    # Rows that have left the window are not a part of the fit.
     rows = monitor.numbers()
     if corrector is not None:
         task = replace(task, held=corrector.held)
@@ -156,7 +156,7 @@ def observe(
 
 
 def corrected(blocks: Iterator[Aligned], corrector: Corrector | None) -> Iterator[Aligned]:
-    """Yield blocks whose rows are freed of the causes of a corrector, if there is one."""
+    """Yield blocks after removing the causes of a corrector, if there is one, from their rows."""
     if corrector is None:
         yield from blocks
         return
@@ -174,7 +174,7 @@ def observe_log(
     log: Log, settings: Settings, progress: Progress, model: ExtendedModel | None = None,
     shown: Callable[[float, str], None] | None = None,
 ) -> Observed:  # fmt: skip
-    """Observe a log as `observe` does; with a ``model`` its causes are taken out of the rows."""
+    """Observe a log as `observe` does; with a ``model`` its causes are removed from the rows."""
     check_address_space(WORKING_BYTES)
     if is_first_run():
         progress.say(SENTENCE)
@@ -183,7 +183,7 @@ def observe_log(
 
 
 def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
-    """Return the first two thirds of a log and the last, cut at the border of a block.
+    """Return the first two thirds of a log and the last third, cut at a block boundary.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
 
 
 def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:
-    """Refuse a log in which a needed signal has no usable value; say which and why.
+    """Raise `DataError` if a required signal has no usable value; the message gives the reason.
 
     Raises
     ------

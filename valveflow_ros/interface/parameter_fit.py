@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the monitor that follow from a log of the plant, and the file with them."""
+"""Parameters of the monitor estimated from a log of the plant, and the parameter file."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from valveflow_ros.report.words import duration
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 from valveflow_ros.signals.units import DIFFERENCES, unit_of
 
-# A transient cut short spoils segments, one too long only costs some: up in small steps,
-# down in large ones.
+# Too short a transient makes segments wrong, too long a one only makes them fewer: a small
+# excess raises the parameter, only a large one lowers it.
 _MORE, _LESS = 0.05, 0.2
 _SURE = 2.0  # standard errors
 _OF_STEP = ('sample_period', 'hold_limit', 'lateness', 'block', 'longest_segment', 'alarm_block',
@@ -35,7 +35,7 @@ _OF_STEP = ('sample_period', 'hold_limit', 'lateness', 'block', 'longest_segment
 
 @dataclass(frozen=True, slots=True)
 class FittedValue:
-    """A parameter that follows from the data, and from what."""
+    """A parameter estimated from the data, and the basis of the estimate."""
 
     name: str
     value: Value
@@ -50,28 +50,28 @@ class FittedValue:
 
 
 class Fitted(dict[str, FittedValue]):
-    """Fitted parameters by name; ``left`` has a sentence for each that could not be fitted."""
+    """Fitted parameters by name; ``left`` has one sentence for each that could not be fitted."""
 
     def __init__(self) -> None:
         super().__init__()
         self.left: list[str] = []
 
     def put(self, name: str, value: Value, ground: str) -> None:
-        """Add one."""
+        """Add a parameter."""
         self[name] = FittedValue(name, PARAMETERS[name].check(value), clean(ground))
 
     def changes(self) -> dict[str, Value]:
-        """Return the values alone."""
+        """Return the values by name."""
         return {name: one.value for name, one in self.items()}
 
 
 def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT) -> Fitted:
-    """Return the parameters of the monitor that follow from a log.
+    """Return the parameters of the monitor that can be estimated from a log.
 
     Parameters
     ----------
     log : Log, str, Path or pandas.DataFrame
-        What `open_log` returned, or anything it opens.
+        The result of `open_log`, or anything that it opens.
     unit_tag : str
         Tag of the unit.
     progress : Progress
@@ -79,7 +79,7 @@ def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT)
     Raises
     ------
     DataError
-        It holds no readings.
+        The log contains no readings.
     """
     log = as_log(log, progress)
     if not len(log.readings):
@@ -129,7 +129,7 @@ def _steps(log: Log, found: Fitted) -> None:
 
 
 def _window(log: Log, found: Fitted) -> dict[str, float]:
-    """Return a window that holds the whole log; that of the monitor stays as it is."""
+    """Return a window for the whole log; the monitor's own window is not changed."""
     adapted = fitting(log.steps(), log.span_s, found.changes())
     return {name: value for name, value in adapted.items() if name == 'window_days'}
 
@@ -187,23 +187,23 @@ def _largest(curve: Characteristic, found: Fitted) -> None:
 
 
 def parameter_file(source: str, found: Fitted) -> str:
-    """Return the text of a ROS 2 parameter file for any node name.
+    """Return the text of a ROS 2 parameter file that is valid for any node name.
 
     Parameters
     ----------
     source : str
         Name of the log.
     found : Fitted
-        Parameters that follow from it.
+        Parameters estimated from the log.
 
     Raises
     ------
     ParameterError
-        Values are at odds with each other.
+        Values contradict each other.
     """
     values = found.changes()
     Settings(values)
-    # Names of files and columns come from others: a line break in one would end the comment.
+    # Names of files and columns are not trusted: a line break in a name would end the comment.
     lines = [
         f'# Parameters of the monitor, fitted to {clean(source)} by valveflow {__version__}.',
         "# Lines marked 'fitted' follow from the data; all others are the defaults.",

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Values that cannot be what their unit says, and signals that were not logged."""
+"""Values that are implausible for their unit, and signals that were not logged."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.records import FLOW_UNITS, SIGNALS, FloatArray, Quality, Readings, Signal
 from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, unit_of
 
-# What the signals of a steam unit in operation usually read, in engine units.
+# Usual ranges of the signals of a steam unit in operation, in engine units.
 _USUAL = {
     Signal.VALVE_OPENING: (3.0, 102.0),
     Signal.MAIN_STEAM_PRESSURE: (2.0, 35.0),
@@ -25,28 +25,28 @@ _USUAL = {
     Signal.GENERATED_POWER: (3.0, 1800.0),
     Signal.VALVE_COMMAND: (3.0, 102.0),
 }
-# A pressure must be positive, and nothing is colder than this.
+# A pressure must be positive; the temperature is absolute zero.
 _LEAST_MPA, _COLDEST_DEGC = 1e-6, -273.15
-_MANY = 0.02  # share of impossible values that is reported
-_MOST = 0.5  # with so many, a column is not the signal it is named after
+_MANY = 0.02  # fraction of impossible values that is reported
+_MOST = 0.5  # above this fraction, the unit or the column is wrong
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """A signal whose values do not suit its unit.
+    """A signal whose values are implausible for its unit.
 
     Attributes
     ----------
     signal : Signal
     impossible : float
-        Share of its values that the engine will reject.
+        Fraction of its values that the engine will reject.
     looks_like : str
-        The unit that would suit, empty if none does; of several the one in which the values
-        come nearest to the middle of what is usual.
+        A unit in which the values are usual, empty if there is none; of several units the one
+        that brings the values nearest to the middle of the usual range.
     sentence : str
-        What to tell a person, without the option that would help.
+        The message for the user, without the option that solves the problem.
     also : tuple of str
-        Further units that would suit.
+        Further units in which the values are usual.
     """
 
     signal: Signal
@@ -56,7 +56,7 @@ class Doubt:
     also: tuple[str, ...] = ()
 
     def advice(self, theirs: str) -> str:
-        """Return the sentence with the exact option that helps; ``theirs`` is the column."""
+        """Return the message with the exact option that helps; ``theirs`` is the column."""
         if not self.looks_like:
             return self.sentence
         topic = SIGNALS[self.signal].topic
@@ -65,7 +65,7 @@ class Doubt:
 
 
 def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
-    """Return the range outside of which a value is rejected."""
+    """Return the range outside which a value is rejected."""
     name = 'valve_opening' if signal == Signal.VALVE_COMMAND else SIGNALS[signal].topic
     return settings.real(f'{name}_low'), settings.real(f'{name}_high')
 
@@ -73,10 +73,10 @@ def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
 def limits_beside_steam(
     units: Mapping[Signal, str], constants: Mapping[Signal, float]
 ) -> dict[str, float]:
-    """Return the limits of values, as parameters, that are not those of a steam unit's signals.
+    """Return the limits of values, as parameters, that differ from those of a steam unit.
 
-    A flow may be of any fluid; a pressure difference may be small; a person knows how warm it is
-    who gives that as a constant.
+    A flow may be of any fluid and a pressure difference may be small. A temperature that the
+    user gives as a constant is accepted.
     """
     found: dict[str, float] = {}
     if units.get(Signal.MAIN_STEAM_PRESSURE) in DIFFERENCES:
@@ -98,18 +98,18 @@ def limits_beside_steam(
 def doubt(
     signal: Signal, written: FloatArray, unit: str, settings: Settings, steam: bool = True
 ) -> Doubt | None:
-    """Judge the values of one signal.
+    """Check the values of one signal; return None if they are plausible.
 
     Parameters
     ----------
     written : float64 (n,)
-        As they stand in the log.
+        Values in the unit of the log.
     unit : str
-        The unit they are taken to have.
+        The assumed unit of the values.
     settings : Settings
-        With the limits of what is possible.
+        Settings with the limits of possible values.
     steam : bool
-        What is usual in a steam unit can be expected, too.
+        Also expect the usual ranges of a steam unit.
     """
     written = written[np.isfinite(written)]
     if not len(written):
@@ -140,7 +140,7 @@ def doubt(
 def _better_units(
     signal: Signal, written: FloatArray, unit: str, allowed: tuple[float, float]
 ) -> tuple[str, ...]:
-    """Return the units in which the values would be usual when in their own they are not."""
+    """Return units in which the values would be usual, if they are unusual in their own unit."""
     middle = float(np.median(written))
     low, high = _USUAL[signal]
 
@@ -156,7 +156,7 @@ def _better_units(
     own = unit_of(signal, unit)
     if usual(unit):
         return ()
-    # Of two names of one unit the first.
+    # If two units are equal, keep the first.
     others = {other: name for name, other in reversed(UNITS[signal].items()) if other != own}
     return tuple(sorted(
         (name for name in reversed(others.values()) if usual(name)),
@@ -165,14 +165,14 @@ def _better_units(
 
 
 def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:
-    """Refuse a table in which every main steam pressure is impossible, or a unit surely wrong.
+    """Refuse a table if all its main steam pressures are impossible, or a unit is surely wrong.
 
-    That is one in which most values of a signal are impossible and that another would suit.
+    A unit is surely wrong if most values are impossible in it and usual in another unit.
 
     Raises
     ------
     RefusedError
-        With the options that would help.
+        Contains the options that would help.
     """
     for found in doubts:
         lost = found.signal == Signal.MAIN_STEAM_PRESSURE and found.impossible >= 1.0
@@ -192,12 +192,12 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
 def refuse_guesses(
     path: object, doubts: Iterable[Doubt], guessed: Container[Signal], names: dict[Signal, str]
 ) -> None:
-    """Refuse the columns that were found by their names and whose values speak against it.
+    """Refuse columns that were found by their names and whose values contradict this.
 
     Raises
     ------
     RefusedError
-        With the options that would help.
+        Contains the options that would help.
     """
     problems, remedies = [], []
     for found in doubts:
@@ -219,7 +219,7 @@ def refuse_guesses(
 
 
 def air_note(signal: Signal, unit: str, theirs: str) -> str:
-    """Return the sentence on what is added to a gauge pressure, empty for other units."""
+    """Return a sentence on the air pressure added to a gauge pressure, empty for other units."""
     air = air_in(signal, unit)
     if not air:
         return ''
@@ -230,7 +230,7 @@ def air_note(signal: Signal, unit: str, theirs: str) -> str:
 
 
 def check_constants(constants: dict[Signal, float], settings: Settings) -> None:
-    """Refuse constants that the engine would reject at each row with these limits.
+    """Raise `UsageError` if a constant is outside these limits.
 
     Raises
     ------
@@ -249,12 +249,12 @@ def check_constants(constants: dict[Signal, float], settings: Settings) -> None:
 
 
 def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
-    """Put each constant beside every reading of a measured signal.
+    """Add each constant at every reading of a measured signal.
 
     Raises
     ------
     DataError
-        If no signal is measured.
+        No signal is measured.
     """
     if not constants:
         return readings

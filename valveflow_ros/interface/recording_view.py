@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A recording, finished or growing, as frames of the terminal view."""
+"""Frames of the terminal view from a recording, which may still be growing."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from valveflow_ros.signals.units import convert, known_units
 
 _SILENT_S = 5.0
 _SILENT_STEPS = 10.0
-# A rejected reading is told of for so long.
+# How long a rejected reading is shown.
 _TOLD_S = 60.0
 
 
 @dataclass(slots=True)
 class _Track:
-    """What is remembered of one signal."""
+    """State of one signal."""
 
     topic: str
     last_ns: int = 0
@@ -45,7 +45,7 @@ class _Track:
 
 
 class InputWatch:
-    """Follows the readings of each signal."""
+    """Follow the readings of each signal."""
 
     def __init__(self) -> None:
         self._settings = Settings()
@@ -53,18 +53,18 @@ class InputWatch:
         self._tracks: dict[Signal, _Track] = {}
 
     def parameters(self, attached: bytes) -> None:
-        """Take the parameters that the recording was made with."""
+        """Set the parameters with which the recording was made."""
         try:
             given = json.loads(attached)
             self._settings = Settings(given)
         except (ValueError, TypeError, ValveflowError):
-            # Of another version, perhaps: the defaults judge well enough for a look.
+            # Perhaps from another version: the defaults are good enough for a view.
             return
         named = {info.signal: given.get(f'{info.topic}_unit') for info in SIGNALS}
         self._units = {s: str(unit) for s, unit in named.items() if unit in known_units(s)}
 
     def take(self, signal: Signal, topic: str, rows: Rows) -> None:
-        """Take readings of a signal, in their order."""
+        """Add readings of a signal, in their order."""
         if not len(rows.value):
             return
         track = self._tracks.setdefault(signal, _Track(topic))
@@ -86,7 +86,7 @@ class InputWatch:
             track.refused_ns = int(rows.log_time[wrong[-1]])
 
     def health(self, newest_ns: int) -> tuple[HealthView, ...]:
-        """Return how each signal is; an optional one that never came is left out.
+        """Return the health of each signal; an optional signal without readings is left out.
 
         Parameters
         ----------
@@ -125,26 +125,26 @@ _STILL_S = 10.0
 
 
 class LogWatch:
-    """Follows a recording and says what it tells.
+    """Follow a recording and return its state.
 
     Parameters
     ----------
     path : Path
         An ``.mcap`` file, an ``.mcap.part``, a recording's folder, or a folder of those.
     board : Board, optional
-        What keeps the state; one of its own by default.
+        Object that keeps the state; a new one by default.
     kept : int
-        How many of the newest predictions are told to the board, at the start and later.
+        Number of newest predictions that are passed to the board, at the start and later.
 
     Raises
     ------
     RecordingError
-        It is none of these.
+        The path is none of these.
 
     Attributes
     ----------
     share : float
-        How much of the present file has been read, 0 to 1.
+        Fraction of the present file that has been read, 0 to 1.
     """
 
     def __init__(self, path: Path, board: Board | None = None, kept: int = KEPT) -> None:
@@ -156,7 +156,7 @@ class LogWatch:
         self._wanted = {**_WANTED, PREDICTION: kept}
         self._inputs = InputWatch()
         self._parameters = b''
-        # Most of those of a long recording are never looked at.
+        # Decoded on demand: most predictions of a long recording are never shown.
         self._predictions: deque[Raw] = deque(maxlen=kept)
         self._newest_ns = 0
         self._grown_s = time.monotonic()
@@ -170,11 +170,11 @@ class LogWatch:
 
     @property
     def finished(self) -> bool:
-        """Return whether nothing more will come."""
+        """Return True if the recording is complete and will not grow."""
         return self._follower.finished
 
     def read(self) -> Iterator[None]:
-        """Take what was added; pauses now and then, so that something can be drawn meanwhile."""
+        """Read new data; yield from time to time so that the caller can draw."""
         for batch in self._follower.read():
             self._take(batch)
             self.share = batch.share
@@ -182,7 +182,7 @@ class LogWatch:
         self.share = 1.0
 
     def frame(self) -> Frame:
-        """Return what is known now."""
+        """Return the present state."""
         while self._predictions:
             self._tell(self._predictions.popleft())
         self._board.inputs = self._inputs.health(self._newest_ns)
@@ -244,7 +244,7 @@ class LogWatch:
 
 
 def recording_in(path: Path) -> Path:
-    """Return the recording a name stands for: itself, or the newest in a folder of recordings.
+    """Return the recording at a path: itself, or the newest in a folder of recordings.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters for a log: from its own step, a file, and what a person sets, in this order."""
+"""Parameters for a log: from its step, from a file, and from the user, in this order."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from valveflow_ros.records import Signal
 
 _ROUND_S = (1.0, 2.0, 5.0, 6.0, 10.0, 12.0, 15.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0,
             1800.0, 3600.0)  # fmt: skip
-# A finished log is fitted once, at its end, whatever a live monitor would do.
+# A finished log is fitted once, at its end, in contrast to a live monitor.
 ONE_FIT = {'refit_period': 0.0, 'refit_segments': 0}
 _TRUE, _FALSE = ('true', 'yes', 'on'), ('false', 'no', 'off')
 
 
 def sample_period(steps: Mapping[Signal, float]) -> float:
-    """Return the step of the table that suits readings with these steps, in s.
+    """Return a suitable step of the table for readings with these steps, in s.
 
-    The quickest signal decides; below the default of one second the engine
-    averages anyway, so the table is never finer than that by itself.
+    The fastest signal decides. The result is at least the default of one second; faster
+    readings are averaged.
     """
     base = float(PARAMETERS['sample_period'].default)
     if not steps:
@@ -44,7 +44,7 @@ def sample_period(steps: Mapping[Signal, float]) -> float:
 def fitting(
     steps: Mapping[Signal, float], span_s: float, given: Mapping[str, object]
 ) -> dict[str, float]:
-    """Return the parameters that follow from the data and differ from the defaults.
+    """Return the parameters that depend on the data and differ from the defaults.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def fitting(
     span_s : float
         Length of the log.
     given : mapping
-        What a person has set; it decides over what would be inferred.
+        Parameters set by the user; they override the inferred ones.
     """
     default = {name: row.default for name, row in PARAMETERS.items()}
     period = given.get('sample_period', sample_period(steps))
@@ -80,9 +80,9 @@ def fitting(
 
 
 def _window_days(span_s: float, period: float, longest_s: float) -> float:
-    """Return a window that holds the whole log, not shorter than the default.
+    """Return a window for the whole log, not shorter than the default.
 
-    Of rows finer than usual only as many as the log has, for the sake of memory.
+    If the rows are finer than by default, the window is as long as the log, to save memory.
     """
     fine = period < float(PARAMETERS['sample_period'].default)
     least = 1.1 * longest_s / 86400.0 if fine else float(PARAMETERS['window_days'].default)
@@ -92,9 +92,9 @@ def _window_days(span_s: float, period: float, longest_s: float) -> float:
 def read_parameters(
     file: Path | None, pairs: Sequence[str], *, of_node: bool = False
 ) -> dict[str, Any]:
-    """Return what a person has set: the file's values, then those of ``--set``.
+    """Return the user's parameters: the values of the file, overridden by those of ``--set``.
 
-    ``of_node``: the file must be written as ROS 2 asks for it, values below a node's name.
+    ``of_node``: the file must have the form of ROS 2, with the values below a node's name.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def read_parameters(
 
 
 def _value(name: str, text: str) -> object:
-    """Read a text as what the parameter is."""
+    """Convert a text to the type of the parameter."""
     default = parameter(name).default
     if isinstance(default, str):
         return text
@@ -157,7 +157,7 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
 
 
 def _without_node(content: dict[Any, Any]) -> str:
-    """Return the first name that stands below no ``ros__parameters``; empty if none does."""
+    """Return the first name that is not below ``ros__parameters``; empty if all are."""
     for name, value in content.items():
         if name == 'ros__parameters' and isinstance(value, dict | None):
             continue
@@ -168,7 +168,7 @@ def _without_node(content: dict[Any, Any]) -> str:
 
 
 def _flat(content: dict[Any, Any]) -> dict[str, Any]:
-    """Take the values out of ``node: ros__parameters:`` or from the top."""
+    """Return the values from below ``node: ros__parameters:`` or from the top level."""
     values: dict[str, Any] = {}
     for name, value in content.items():
         if isinstance(value, dict):
@@ -187,15 +187,15 @@ def settings_for(
     live: bool = False,
     held: bool = False,
 ) -> tuple[Settings, list[str]]:
-    """Return the complete settings for a log, and sentences about what was adapted.
+    """Return the complete settings for a log, and notes on the adapted parameters.
 
-    The curve is fitted once, at the end, unless all is to go as in a ``live`` monitor. ``held``:
-    the values of a compressed log were held, which was told with the step of the rows.
+    The curve is fitted once, at the end, unless ``live`` requests the behaviour of a live
+    monitor. ``held``: values of a compressed log were repeated; a note on this exists already.
 
     Raises
     ------
     ParameterError
-        Values are at odds with each other.
+        Values contradict each other.
     """
     adapted = fitting(steps, span_s, given)
     settings = Settings({**adapted, **given, **({} if live else ONE_FIT)})

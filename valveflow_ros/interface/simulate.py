@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``simulate``: the unit of the paper's study or one built from physics, with effects."""
+"""``simulate``: the unit of the paper's study or a physical model, with effects."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ PAPER = 'paper'
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """A simulated log and the truth behind it.
+    """A simulated log and its true values.
 
     Attributes
     ----------
     data : SimulatedLog or ThermalLog
-        What the instruments wrote, and true input, power and plug as arrays.
+        The measured values, and the true input, power and plug position as arrays.
     days : float
     seed : int
     """
@@ -51,14 +51,14 @@ class Simulation:
 
     @property
     def log(self) -> Log:
-        """Return what the instruments wrote as a log, to hand on to `identify` and others."""
+        """Return the measured values as a log for `identify` and other functions."""
         return open_log(self.to_dataframe())
 
     def to_dataframe(self) -> Any:
-        """Return what the instruments wrote as a pandas.DataFrame, as `open_log` takes it.
+        """Return the measured values as a pandas.DataFrame that `open_log` accepts.
 
         A unit other than the paper's has further columns, such as ``condenser_pressure_kpa``.
-        Where each value has a time of its own, NaN means that there is no new value.
+        If each signal has its own times, NaN means that there is no new value.
         """
         import pandas as pd
 
@@ -67,12 +67,12 @@ class Simulation:
         return pd.DataFrame({'time': pd.to_datetime(table.time_ns, utc=True), **columns})
 
     def static_power(self, opening_percent: FloatArray, pressure_mpa: FloatArray) -> FloatArray:
-        """Return the true power at rest in MW, without effects.
+        """Return the true steady-state power in MW, without effects.
 
         Parameters
         ----------
         opening_percent, pressure_mpa : float64 (n,)
-            True opening in %, and pressure in MPa absolute; one of them may be a number.
+            True opening in %, and pressure in MPa absolute; one of them may be a scalar.
         """
         unit = self.data.unit
         if isinstance(unit, ThermalUnit):
@@ -84,9 +84,9 @@ class Simulation:
         return self.data.extra if isinstance(self.data, ThermalLog) else {}
 
     def to_json(self) -> dict[str, Any]:
-        """Return what is true of the plant, equal to the file of ``--truth``.
+        """Return the true values of the plant, equal to the file of ``--truth``.
 
-        The last region of the dynamics of the paper's unit has no upper end: null.
+        The last region of the dynamics of the paper's unit has the upper end null: no limit.
         """
         if isinstance(self.data, ThermalLog):
             return {'days': self.days, 'seed': self.seed, **self.data.to_json()}
@@ -118,18 +118,18 @@ class Simulation:
     def write(
         self, path: str | Path, *, truth: str | Path | None = None, overwrite: bool = False
     ) -> Path:
-        """Write the log, and what is true of the plant where ``truth`` names a file.
+        """Write the log, and the true values of the plant if ``truth`` names a file.
 
         Parameters
         ----------
         path : str or Path
-            ``.mcap``, ``.csv``, ``.parquet``, or a folder as ros2 bag makes it. Only tables
-            hold columns beside the five signals.
+            ``.mcap``, ``.csv``, ``.parquet``, or a folder as in ros2 bag. Only tables
+            contain columns other than the five signals.
 
         Raises
         ------
         RecordingError
-            It cannot be written, or is there already.
+            It cannot be written, or exists already.
         """
         path = Path(path)
         check_log(path, overwrite=overwrite)
@@ -150,7 +150,7 @@ class Simulation:
                 write_table(self.data.table, draft, self._extra())
             return path
         if isinstance(self.data, ThermalLog) and self.data.historian.own_times:
-            # A row of a recording would hold values that were never sent.
+            # A recording in rows would contain values that were never sent.
             return write_readings(
                 [self.data.readings], [info.signal for info in SIGNALS], path,
                 overwrite=overwrite or is_empty(path),
@@ -168,37 +168,37 @@ def simulate(
     start_ns: int = DEFAULT_START_NS,
     progress: Progress = SILENT,
 ) -> Simulation:
-    """Simulate a unit under load control and what its historian kept.
+    """Simulate a unit under load control and the values kept by its historian.
 
     Parameters
     ----------
     days : float
-        Length, more than 0 and at most 400 (of a unit other than the paper's: 60).
+        Duration, more than 0 and at most 400 (60 for a unit other than the paper's).
     seed : int
         The same seed gives the same log.
     effects : sequence of str or EffectSpec
-        What to switch on, each ``NAME[:key=value,...]``.
+        Effects to switch on, each ``NAME[:key=value,...]``.
     unit : str or ThermalUnit
         'paper': the 300 MW unit of the paper's study, its power a function of V p^m. The others
         are reheat units of about 330 MW with a boiler, a governor, AGC and primary response:
-        'choked' has one group of valves and the flow p^m f(V), 'sequence' three or four valves
-        that open one after the other, 'integrated_input' the paper's form; at sliding pressure,
-        and with '_fixed' behind the name at fixed pressure. ``NAME:number=7`` is another unit
-        of the kind, ``vacuum_per_kpa`` and ``temperature_per_k`` are how far its power follows
-        condenser pressure and steam temperature.
+        'choked' has one group of valves and the flow p^m f(V), 'sequence' has three or four
+        valves that open in sequence, 'integrated_input' has the paper's form. They have sliding
+        pressure, or fixed pressure with '_fixed' after the name. ``NAME:number=7`` is another
+        unit of this kind; ``vacuum_per_kpa`` and ``temperature_per_k`` set how much its power
+        depends on condenser pressure and steam temperature.
     recording : str or Historian
-        Of a unit other than the paper's: '1s' every sample, 'minute' means of a minute,
-        'compressed' exception compression with values at their own times. Options follow as in
+        For a unit other than the paper's: '1s' every sample, 'minute' means of a minute,
+        'compressed' exception compression with values at their own times. Options are given as
         ``compressed:resample_s=60,dropouts_per_day=2``: ``band_percent``, ``scan_low_s``,
         ``scan_high_s``, ``longest_s``, ``resample_s``, ``dropouts_per_day``, ``dropout_minutes``.
     start_ns : int
-        Time of the first sample; it decides the time of day, taken as UTC.
+        Time of the first sample, ns since 1970; it determines the time of day in UTC.
     progress : Progress
 
     Raises
     ------
     InputError
-        An argument is out of range, or effects that cannot act in this run or not together.
+        An argument is out of range, or effects cannot act in this run or not together.
     """
     if not isinstance(recording, Historian):
         recording = Historian.parse(recording)
@@ -211,7 +211,7 @@ def simulate(
         )
     specs = [e if isinstance(e, EffectSpec) else EffectSpec.parse(e) for e in effects]
     parts: list[SimulatedLog] = []
-    # Day by day, which gives the same as all at once and can be watched.
+    # Simulating day by day gives the same result as one call, and allows progress reports.
     for part in simulate_parts(days, seed, start_ns=start_ns, effects=specs):
         parts.append(part)
         progress(min(0.6, 0.6 * len(parts) / days), 'simulating')

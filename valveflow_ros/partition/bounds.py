@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a block of candidate breaks can give at best, whatever lies to its right.
+"""Lower bounds of the cost for a block of candidate breaks, for any samples to its right.
 
 Write ``A(l)`` for the sum of squared residuals of the samples ``A`` about a
 line ``l``; it is a quadratic in the two numbers of the line, with Gram matrix
@@ -12,7 +12,7 @@ pieces that end at position ``w``. For a break ``w`` in a node that ends at
 
     K(l) = cost(K) + |l - k|^2 in the metric H_K ,
 
-and if ``H1 + H2 <= H_K`` then, giving each part a core's share of its own,
+and if ``H1 + H2 <= H_K`` then, giving each part a fraction of the core,
 
     cost([w, r)) = min_l B(l) + K(l) + L(l) >= cost(K) + f_B(k) + f_L(k) ,
     f_A(k) = min_l A(l) + |l - k|^2 in the metric H1 (for B) or H2 (for L) .
@@ -22,7 +22,7 @@ of a jointly convex function, therefore convex in ``k``, therefore above its
 tangent at any reference line ``k0``. The smallest ``D(w) + f_B(k0)`` of a node
 and the smallest and largest tangent slopes over it are five numbers that can
 be prepared for a whole layer; they bound every pair of a break in the node and
-an end in the group from below at the cost of one line fit:
+an end in the group from below with the work of one line fit:
 
     D(w) + cost([w, r)) >= P + min over the box of slopes (slope . (k - k0))
                              + cost(K) + the same for the tail .
@@ -30,12 +30,12 @@ an end in the group from below at the cost of one line fit:
 Here ``H1`` is `SHARE` times the Gram matrix of a window of samples that follows the
 node, and ``k0`` the best line of that window; without a window (slot 0)
 ``f_B = cost(B)``, which needs no line. The farther away the group, the larger
-the window that fits, and the smaller what the inequality gives away: for white
-noise it falls like sqrt(node / window), on smooth curves it falls because the
+the window that fits, and the smaller the loss by the inequality: for white noise
+it decreases like sqrt(node / window), on smooth curves it decreases because the
 core's line and the window's line agree.
 
-No statistics is assumed: a node that is dropped by this bound cannot hold a
-better break.
+No statistical assumption is made: a node that is excluded by this bound cannot
+contain a better break.
 """
 
 from __future__ import annotations
@@ -56,22 +56,22 @@ from valveflow_ros.partition.moments import (
 )
 from valveflow_ros.records import FloatArray
 
-# Windows that a node knows a bound for: none, then its own size times 1, 4, 16, 64, 256.
+# Windows for which a node has a bound: none, then its own size times 1, 4, 16, 64, 256.
 SLOTS = 6
-# Two shares of one core, a little less than halves so that rounding cannot make them more.
+# Two fractions of one core, slightly below 1/2 so that rounding cannot make their sum exceed 1.
 SHARE = 0.499999
 
 
 @kernel
 def _window_prior(tree: Tree, first: int, last: int, limit: float, out: FloatArray) -> None:
-    """Gram matrix and line of the blocks ``[first, last)`` about the sample before them."""
+    """Return Gram matrix and line of the blocks ``[first, last)`` about the sample before them."""
     m = blocks_moments(tree, first, last)
     width = tree.x[LEAF * last - 1] - tree.x[LEAF * first - 1]
     _, value, slope, _ = fit(m)
     value += slope * width
     left = tree.x[LEAF * first - 1] - tree.x[max(LEAF * first - LEAF * (last - first), 0)]
     if not max(abs(value), abs(value + slope * left)) <= limit:
-        # A steep line through a cluster is no use as a reference and costs digits.
+        # A steep line through a cluster is no useful reference and loses digits.
         value = m[3] / m[0]
         slope = 0.0
     out[0] = SHARE * m[0]
@@ -134,7 +134,7 @@ def _candidate_costs(
 
 @inlined
 def least_and_most(row: FloatArray) -> tuple[float, float]:
-    """Return the extremes of `LEAF` numbers, in four chains for the sake of latency."""
+    """Return the extremes of `LEAF` numbers, in four independent chains to reduce latency."""
     a0 = b0 = row[0]
     a1 = b1 = row[1]
     a2 = b2 = row[2]
@@ -157,8 +157,8 @@ def fill_leaf_bounds(
 ) -> None:
     """Fill ``bound[block, slot]`` of the full blocks in ``[first, last)`` from their candidates.
 
-    The five numbers are P, then the box of slopes: least and most along the
-    line's value at the node's last sample, least and most along that at its first.
+    The five numbers are P, then the box of slopes: minimum and maximum along the line's
+    value at the node's last sample, minimum and maximum along that at its first.
     """
     blocks = tree.start[1]
     out = np.empty((3, LEAF))
@@ -189,17 +189,17 @@ def make_priors(tree: Tree, limit: float) -> NDArray[np.float64]:
 # For a child that ends at ``c`` inside a parent that ends at ``e``, the samples
 # ``[c, e)`` together with the parent's prior are a core in the sense of
 # `partition.bounds`: a quadratic in the line whose minimum lies at a line ``k``
-# that is an affine function of the line the parent is asked about. So
+# that is an affine function of the line at which the parent is evaluated. So
 #
 #     f_parent(m) >= (least of that quadratic)(m) + f_child(k(m)) ,
 #
-# as long as the child's own window does not reach beyond the parent's. Put in
-# the child's P and box of slopes, and the parent has a P and a box of slopes.
+# if the child's own window does not extend beyond the parent's. The child's P
+# and box of slopes then give the P and box of slopes of the parent.
 
 
 @inlined
 def _between(lo: float, hi: float, factor: float) -> tuple[float, float]:
-    """Multiply the interval from ``lo`` to ``hi``."""
+    """Multiply the interval from ``lo`` to ``hi`` by a factor."""
     a = lo * factor
     b = hi * factor
     return min(a, b), max(a, b)
@@ -214,7 +214,7 @@ def _lift(
     between: Moments,
     out: FloatArray,
 ) -> None:
-    """Turn the bound of a child into one of its parent and widen ``out`` by it.
+    """Convert the bound of a child into one of its parent and widen ``out`` by it.
 
     ``between`` are the samples from the child's end to the parent's. They and the
     parent's prior are the child's core. ``ends`` are the distances, to the left of the
@@ -264,7 +264,7 @@ def _lift(
 
 @inlined
 def _lift_flat(child: FloatArray, out: FloatArray) -> None:
-    """Widen ``out`` by a child's bound that depends on no line: cost(B) >= cost(part of B)."""
+    """Widen ``out`` by a child's bound without a line: cost(B) >= cost(part of B)."""
     out[0] = min(out[0], child[0])
     out[1] = min(out[1], 0.0)
     out[2] = max(out[2], 0.0)

@@ -1,12 +1,12 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A group of ends that are searched together, and what is known about them so far.
+"""A group of ends that are searched together, and the best results for them so far.
 
-Seen from a break far to the left, the ends of a group differ only in the tail:
-the group's own samples up to each end. The tail's share in the cost of the last
-piece is bounded the same way as the left part's (`partition.bounds`): about a
-reference line, with a share of the core's Gram matrix as prior, linearly in the
-line, over all ends at once.
+For a break far to the left, the ends of a group differ only in the tail: the
+group's own samples up to each end. The part of the tail in the cost of the last
+piece is bounded in the same way as the left part (`partition.bounds`): about a
+reference line, with a fraction of the core's Gram matrix as prior, linearly in
+the line, for all ends together.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from valveflow_ros.records import FloatArray, IntArray
 
 
 class Group(NamedTuple):
-    """Scratch of one group of ends.
+    """Working memory of one group of ends.
 
     Attributes
     ----------
     tail : float64 (6, LEAF)
         Moments of the group's samples up to each end; the origin is the sample before them.
     best : float64 (LEAF,)
-        Least cost known for each end; -inf for an end that nobody asks about.
+        Smallest cost found for each end; -inf for an end that is not needed.
     breaks : int64 (LEAF,)
-        The break that gives it, or -1.
+        The break of that cost, or -1.
     excess : float64 (LEAF,)
         Bound of the tail's cost about the reference line, for each end.
     line : float64 (8,)
@@ -72,7 +72,7 @@ new_group = inlined(_new_group)
 
 @kernel
 def open_group(tree: Tree, block: int, reachable: int, group: Group) -> None:
-    """Set up the group that begins at ``block``; ends before ``reachable`` are not asked for."""
+    """Set up the group that begins at ``block``; ends before ``reachable`` are not needed."""
     first = LEAF * block
     origin = tree.x[max(first - 1, 0)]
     n = x1 = x2 = y1 = xy = yy = 0.0
@@ -94,7 +94,7 @@ def open_group(tree: Tree, block: int, reachable: int, group: Group) -> None:
         tail[4, k] = xy
         tail[5, k] = yy
         end = first + 1 + k
-        # An end that nobody asks about must not keep a candidate alive.
+        # An end that is not needed must not prevent the exclusion of a candidate.
         group.best[k] = np.inf if reachable <= end <= tree.n else -np.inf
         group.breaks[k] = -1
     group.line[7] = origin - tree.x[first + LEAF - 1]
@@ -102,7 +102,7 @@ def open_group(tree: Tree, block: int, reachable: int, group: Group) -> None:
 
 @inlined
 def try_break(group: Group, m: Moments, cost: float, break_: int, first: int) -> bool:
-    """Try one break for the ends ``first..`` of the group; ``m`` reaches up to the group."""
+    """Try one break for the ends ``first..`` of the group; ``m`` extends up to the group."""
     t = group.tail
     total = group.cost
     best = group.best
@@ -116,7 +116,7 @@ def try_break(group: Group, m: Moments, cost: float, break_: int, first: int) ->
         sxy = (m[4] + t[4, k]) - x1 * y * each
         c = ((m[5] + t[5, k]) - y * y * each) - (sxy * sxy / sxx if sxx > 0.0 else 0.0)
         total[k] = cost + (c if c > 0.0 else 0.0)
-    # Counting first keeps the usual case, nothing better, free of branches and stores.
+    # Counting first avoids branches and stores in the usual case without improvement.
     for k in range(LEAF):
         better += total[k] < best[k]
     if better == 0:
@@ -132,7 +132,7 @@ def try_break(group: Group, m: Moments, cost: float, break_: int, first: int) ->
 
 @inlined
 def refresh(group: Group) -> None:
-    """Renew the smallest distance between the tail's bound and the best known cost."""
+    """Update the smallest difference between the tail's bound and the best known cost."""
     e = group.excess
     b = group.best
     low0 = low1 = low2 = low3 = np.inf
@@ -148,14 +148,14 @@ def refresh(group: Group) -> None:
 def bound_about_line(
     group: Group, core: Moments, value: float, slope: float, limit: float
 ) -> None:
-    """Bound the tail's cost about a line, with a share of the core's Gram matrix as prior.
+    """Bound the tail's cost about a line, with a fraction of the core's Gram matrix as prior.
 
-    The bound holds for this core and for every core that begins farther left.
+    The bound is valid for this core and for every core that begins farther left.
     """
     t = group.tail
     line = group.line
     if not max(abs(value), abs(value + slope * line[7])) <= limit:
-        # A steep line through a cluster is no use as a reference and costs digits.
+        # A steep line through a cluster is no useful reference and loses digits.
         value = core[3] / core[0]
         slope = 0.0
     line[0] = value
@@ -190,7 +190,7 @@ def bound_about_line(
 
 @inlined
 def bound_about_best_line(group: Group) -> None:
-    """Bound the tail's cost by its own best line, while there is no core yet."""
+    """Bound the tail's cost by its own best line, as long as there is no core."""
     t = group.tail
     excess = group.excess
     for k in range(t.shape[1]):
@@ -206,7 +206,7 @@ def bound_about_best_line(group: Group) -> None:
 
 @inlined
 def tail_part(group: Group, value: float, slope: float) -> float:
-    """Lower bound of tail cost minus best known cost, about the line of the core."""
+    """Return a lower bound of tail cost minus best known cost, about the line of the core."""
     line = group.line
     begin = value - line[0]
     end = begin + line[7] * (slope - line[1])
@@ -214,18 +214,18 @@ def tail_part(group: Group, value: float, slope: float) -> float:
     return float(line[6] + box)
 
 
-# Breaks that lie in the same block as the end: short pieces, by direct running sums.
+# Breaks in the same block as the end: short pieces, computed by direct running sums.
 #
-# A block is cut into cells of `CELL` samples. Pieces inside one cell have their
-# costs in a small table. For a break in an earlier cell of the block the cost up
-# to the cell of the end is in a table, and
+# A block is divided into cells of `CELL` samples. The costs of pieces inside one
+# cell are in a small table. For a break in an earlier cell of the block the cost
+# up to the cell of the end is in a table, and
 #
 #     D(w) + cost([w, r)) >= D(w) + cost([w, c)) + cost([c, r)) ,  c the cell's begin,
 #
-# leaves few candidates, which are then worked out sample by sample.
+# leaves few candidates, which are then computed sample by sample.
 
 
-# Samples in a cell; a smaller table against fewer breaks that need no look.
+# Samples in a cell: a larger cell excludes more breaks but needs a larger table.
 CELL = 8
 CELLS = LEAF // CELL
 
@@ -250,7 +250,7 @@ class Near(NamedTuple):
 def running_costs(tree: Tree, sample: int, last: int, out: FloatArray) -> None:
     """Fill ``out[k]`` with the cost of the samples ``sample..sample + k`` up to ``last``.
 
-    The origin is the first of them, in position and value; two samples cost 0.
+    The origin is the first of these samples, in position and value; two samples cost 0.
     """
     n = x1 = x2 = y1 = xy = yy = 0.0
     for k in range(last - sample):
@@ -320,9 +320,9 @@ def make_near(blocks: int) -> Near:
 def _adopt_row(
     cost: FloatArray, offset: float, from_: int, break_: int, best: FloatArray, breaks: IntArray
 ) -> None:
-    """Note a break for the ends where ``cost + offset`` is less than the best known."""
+    """Store a break for the ends at which ``cost + offset`` is less than the best known cost."""
     better = 0
-    # Counting first keeps the usual case, nothing to note, free of branches and stores.
+    # Counting first avoids branches and stores in the usual case without improvement.
     for k in range(cost.shape[0]):
         better += cost[k] + offset < best[k]
     if better > 0:
@@ -344,7 +344,7 @@ def _search_edge(
     best: FloatArray,
     breaks: IntArray,
 ) -> None:
-    """Try the breaks ``[first, at)`` on the ends of the cell that begins at ``at``."""
+    """Try the breaks ``[first, at)`` for the ends of the cell that begins at ``at``."""
     possible = 0
     for i in range(edge.shape[0]):
         possible += before[i] + edge[i] < room
@@ -370,7 +370,7 @@ def search_near(
     best: FloatArray,
     breaks: IntArray,
 ) -> None:
-    """Try all breaks inside a block on all ends inside it.
+    """Try all breaks inside a block for all ends inside it.
 
     Parameters
     ----------

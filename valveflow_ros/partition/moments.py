@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Moments of stretches of samples, without cancellation, and the line through them.
 
-A stretch of weighted samples is known by six sums about an origin ``o``, with
+A stretch of weighted samples is described by six sums about an origin ``o``, with
 ``d = o - x`` the distance to the left of it::
 
     (n, x1, x2, y, xy, yy) = sum of w * (1, d, d*d, y, d*y, y*y)
 
 The origin is always the last sample of the stretch or a later one, so every
-``d`` is >= 0; moving the origin to the right and joining stretches only ever
-adds numbers of one sign. Nothing is obtained as a difference of prefix sums:
-for a short stretch that difference has no correct digit left, and a search
-that believes it finds "optima" that do not exist.
+``d`` is >= 0; moving the origin to the right and joining stretches only adds
+numbers of one sign. Differences of prefix sums are not used: for a short
+stretch such a difference has no correct digit, and a search with it finds
+wrong optima.
 
-The stretches at hand are blocks of `LEAF` samples, each suffix of a block, and
-a tree of nodes in which each holds `BRANCH` nodes of the level below.
+The stretches are blocks of `LEAF` samples, each suffix of a block, and a tree
+of nodes in which each node contains `BRANCH` nodes of the level below.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from valveflow_ros.numerics import inlined, kernel
 from valveflow_ros.records import FloatArray, IntArray
 
-# Samples in a block: the smallest node of the tree, and the ends that are searched together.
+# Samples in a block, which is the smallest node of the tree and one group of ends.
 LEAF = 64
 # Nodes of one level in a node of the next.
 BRANCH = 4
@@ -42,7 +42,7 @@ class Tree(NamedTuple):
     n : int
         Number of samples (distinct openings) before padding.
     levels : int
-        Number of levels of nodes; a node of level ``k`` holds ``BRANCH**k`` full blocks.
+        Number of levels of nodes; a node of level ``k`` contains ``BRANCH**k`` full blocks.
     x, y, w : float64 (blocks * LEAF,)
         Position, value and weight.
     leaf : float64 (blocks, 6, LEAF)
@@ -66,7 +66,7 @@ class Tree(NamedTuple):
 
 @inlined
 def joined(left: Moments, shift: float, right: Moments) -> Moments:
-    """Join two stretches; ``shift`` >= 0 is how far the left one's origin lies to the left."""
+    """Join two stretches; ``shift`` >= 0 is the distance of the left one's origin to the left."""
     n, x1, x2, y, xy, yy = left
     return (
         right[0] + n,
@@ -96,8 +96,8 @@ def node_moments(tree: Tree, number: int) -> Moments:
 def fit(m: Moments) -> tuple[float, float, float, bool]:
     """Return cost, value at the origin, slope per distance, and whether the slope is usable.
 
-    Where the positions are too close together for a slope, the cost returned
-    is 0, a true lower bound, and the line is flat.
+    If the positions are too close together for a slope, the returned cost is 0,
+    a valid lower bound, and the line is flat.
     """
     n, x1, x2, y, xy, yy = m
     mean = y / n
@@ -180,7 +180,7 @@ def build_tree(x: FloatArray, y: FloatArray, w: FloatArray) -> Tree:
 
     Notes
     -----
-    O(n) time; about 75 bytes a sample.
+    O(n) time; about 75 bytes per sample.
     """
     n = len(x)
     blocks = -(-n // LEAF)

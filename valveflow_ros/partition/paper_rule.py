@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The number of pieces by the paper's rule, eq. (24), with a guard against chance."""
+"""The number of pieces by the paper's rule, eq. (24), with a significance test."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.partition.partition import Partition
 from valveflow_ros.records import FloatArray
 
-# A break counts as real when it lowers the cost by more than this many times ln n times the
+# A break is significant if it reduces the cost by more than this many times ln n times the
 # variance of the noise. In simulated data about one line (independent normal, binary and t3
-# noise, 200 to 20000 samples, pieces of at least 1 %) chance stays below 8; without a
-# smallest piece heavy tails do not.
+# noise, 200 to 20000 samples, pieces of at least 1 %) the value was always below 8; without
+# a minimum piece, noise with heavy tails exceeds this.
 _SIGNIFICANT = 8.0
-# Costs below this share of Omega(1), or Omega(1) below this share of the sum of squares about
-# the mean, mean an exact fit.
+# A fit is exact if its cost is below this fraction of Omega(1), or if Omega(1) is below this
+# fraction of the sum of squares about the mean.
 _EXACT = 1e-12
 
 
@@ -34,11 +34,11 @@ class Selection:
     pieces : int
         The chosen J.
     turning_angle : dict
-        Lambda(J) of eq. (24), where it is defined: J = 2 .. J_max - 1.
+        Lambda(J) of eq. (24), which is defined for J = 2 .. J_max - 1.
     cost : dict
         Omega(J) of eq. (19) in MW^2, J = 1 .. J_max.
     note : str
-        Why the rule was overruled, as a sentence; empty when it was not.
+        Why the rule was not followed, as a sentence; empty if it was.
     """
 
     pieces: int
@@ -50,23 +50,23 @@ class Selection:
 def paper_rule(
     cost: Sequence[float] | FloatArray, exact: float = 0.0
 ) -> tuple[dict[int, float], int]:
-    """Return Lambda(J) of eq. (24) for J = 2 .. J_max - 1, and the J where it is largest.
+    """Return Lambda(J) of eq. (24) for J = 2 .. J_max - 1, and the J of its maximum.
 
     Parameters
     ----------
     cost : sequence of float (J_max,)
         Omega(1), Omega(2), ...; finite and >= 0, at least three.
     exact : float
-        Costs up to here count as zero.
+        Costs up to this value are taken as zero.
 
     Returns
     -------
     turning_angle : dict
         Lambda(J) in [-1, 1].
     pieces : int
-        The smallest J of the largest Lambda. Never 1 and never J_max: the rule
-        compares the drop of log Omega into J with the drop out of it, and those
-        two have one drop only.
+        The smallest J with the largest Lambda. Never 1 and never J_max: the rule
+        compares the decrease of log Omega from J - 1 to J with that from J to
+        J + 1, and one of them does not exist at these ends.
 
     Raises
     ------
@@ -75,10 +75,10 @@ def paper_rule(
 
     Notes
     -----
-    Where eq. (24) is not defined: dropping to zero is an infinite drop, so the
-    first exact J has Lambda = 1 and the one before it -1; between two zeros, and
-    where the cost does not drop on either side, there is no turn and Lambda = -1.
-    A rising cost (possible where the smallest piece binds) is no drop.
+    Extensions of eq. (24): a decrease to zero is infinite, so the first exact J
+    has Lambda = 1 and the previous one -1. Between two zeros, and if the cost
+    decreases on neither side, Lambda = -1. An increase of the cost (possible due
+    to the minimum size of pieces) is taken as no change.
     """
     values = [float(c) for c in cost]
     if len(values) < 3:
@@ -93,7 +93,7 @@ def paper_rule(
 
 
 def _drop(before: float, after: float, exact: float) -> float:
-    """Return log(before / after), at least 0; 0 from zero and infinite to zero."""
+    """Return log(before / after), at least 0; 0 if ``before`` is zero, else infinite to zero."""
     if before <= exact or after >= before:
         return 0.0
     return math.inf if after <= exact else math.log(before) - math.log(after)
@@ -114,8 +114,8 @@ def select(partition: Partition, correlation_inflation: float = 1.0) -> Selectio
     ----------
     partition : Partition
     correlation_inflation : float
-        How many times the variance of a long mean of the residual exceeds that of
-        independent samples, at least 1.
+        Ratio of the variance of a long mean of the residual to that of independent
+        samples, at least 1.
 
     Raises
     ------
@@ -124,9 +124,9 @@ def select(partition: Partition, correlation_inflation: float = 1.0) -> Selectio
 
     Notes
     -----
-    The rule is free of scale: it finds a largest turn in any costs, also in those of pure
-    noise about one line, and cannot answer 1. So it is asked only if some partition lowers
-    the cost by more, per break, than chance would.
+    The rule is independent of scale: it finds a maximum for any costs, also for noise about
+    one line, and cannot return 1. So it is only used if some partition reduces the cost
+    per break by more than noise would.
     """
     if not 1.0 <= correlation_inflation < math.inf:
         raise ParameterError('correlation_inflation', f'is {correlation_inflation:g}, not >= 1')
@@ -148,7 +148,7 @@ def select(partition: Partition, correlation_inflation: float = 1.0) -> Selectio
 
 
 def _straight(partition: Partition, inflation: float) -> str:
-    """Say why one piece is enough, or return an empty text."""
+    """Return a sentence why one piece is enough, or an empty text."""
     if len(partition.cost) == 1:
         return f'One piece is all that {partition.n_distinct} distinct u allow.'
     about_mean = partition.y - partition.y.mean()

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exact partition: the best J straight pieces through samples, for all J in one pass.
 
-Solves eqs. (19)-(23) of the paper. The samples are sorted by u, equal u are
-merged into one weighted level (a break inside equal u is meaningless), and the
-dynamic programme of `partition.search` finds, for every J up to the largest,
-the breaks of least cost. Candidates are left out only where a proven lower
-bound (`partition.bounds`) shows that they cannot be better, so the result is
-the optimum and not an estimate.
+It solves eqs. (19)-(23) of the paper. The samples are sorted by u, and equal u
+are merged into one weighted level (a break inside equal u is meaningless). The
+dynamic programme of `partition.search` finds the breaks of minimal cost for every
+J up to the largest. Candidates are excluded only if a proven lower bound
+(`partition.bounds`) shows that they cannot be better, so the result is the
+optimum and not an estimate.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from valveflow_ros.numerics import cores, kernel
 from valveflow_ros.partition.search import best_partitions, prepare
 from valveflow_ros.records import FloatArray, IntArray
 
-# Samples made ready for the search: checked, sorted, equal u merged, scaled.
+# Preparation of the samples for the search: check, sort, merge equal u, scale.
 
 
-# Distinct u closer than this share of the range are one u: no plant resolves them.
+# Values of u closer than this fraction of the range are merged: no plant resolves them.
 _SAME_U = 1e-9
-# Beyond this, or over a range below its inverse, sums of squares leave the range of floats.
+# For larger values, or a range below the inverse, sums of squares overflow or underflow.
 _LARGEST = 1e100
 _HEAVIEST = 1e6
 
@@ -52,13 +52,13 @@ class Levels:
     weight : float64 (levels,)
         Sum of the samples' weights.
     scale : float
-        Root mean square of the levels' residual in the unit of y, or 1 if that is 0.
+        Root mean square of the levels' residual in the unit of y, or 1 if this is 0.
     within : float
-        Sum of squares inside levels, which no partition changes.
+        Sum of squares inside levels, which is the same for all partitions.
     rough : bool
-        Some levels hold u that are not quite equal.
+        True if some levels contain u that are not exactly equal.
     floor : float
-        Costs up to here are rounding of u and y, in the square of the unit of y.
+        Costs up to this value are rounding of u and y, in the square of the unit of y.
     """
 
     u: FloatArray
@@ -79,13 +79,13 @@ class Levels:
 
 
 def make_levels(u: ArrayLike, y: ArrayLike, weight: ArrayLike | None = None) -> Levels:
-    """Check, sort, merge and scale samples; without ``weight`` each counts once.
+    """Check, sort, merge and scale samples; without ``weight`` each has weight 1.
 
     Raises
     ------
     DataError
-        The arrays do not match, hold something that is not a finite number below
-        1e100, u never changes, or a weight is not between 1e-6 and 1e6.
+        The lengths differ, a value is not a finite number below 1e100, u is constant,
+        or a weight is not between 1e-6 and 1e6.
     TooFewSamplesError
         There are fewer than two samples.
     """
@@ -110,7 +110,7 @@ def make_levels(u: ArrayLike, y: ArrayLike, weight: ArrayLike | None = None) -> 
 
 
 def _weights(weight: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Check weights: far smaller or larger ones would leave no digits to the others."""
+    """Check weights: with extreme weights the other samples would be lost by rounding."""
     each = _numbers('weight', weight)
     if each.shape != shape:
         raise DataError(f'weight must be as long as u, {shape}, not {each.shape}.')
@@ -124,23 +124,23 @@ def _weights(weight: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _numbers(name: str, values: ArrayLike) -> FloatArray:
-    """Turn anything array-like into float64, or say that it cannot be."""
+    """Convert an array-like to float64; raise `DataError` if this is impossible."""
     array = np.asarray(values)
     if array.dtype.kind not in 'biuf':
         raise DataError(f'{name} must hold real numbers, not {array.dtype}.')
-    with np.errstate(over='ignore'):  # becomes infinite, which is refused with its place
+    with np.errstate(over='ignore'):  # becomes infinite, which is refused later with its index
         return np.asarray(array, dtype=np.float64)
 
 
 def _grain(values: ArrayLike) -> float:
-    """Return the relative rounding with which values came: that of float32 is much coarser."""
+    """Return the relative rounding of the input's type: that of float32 is much larger."""
     dtype = np.asarray(values).dtype
     finest = float(np.finfo(np.float64).eps)
     return max(finest, float(np.finfo(dtype).eps)) if dtype.kind == 'f' else finest
 
 
 def _check_values(name: str, values: FloatArray) -> None:
-    """Refuse NaN, infinities and what cannot be squared, naming the first of them."""
+    """Raise `DataError` for NaN, infinity and too large values, naming the first of them."""
     bad = np.flatnonzero(~(np.abs(values) <= _LARGEST))
     if len(bad) == 0:
         return
@@ -152,7 +152,7 @@ def _check_values(name: str, values: FloatArray) -> None:
 
 @kernel
 def _level_starts(u: FloatArray, tolerance: float, first: IntArray) -> int:
-    """Begin a level wherever u is more than ``tolerance`` above where the last one began."""
+    """Begin a level if u is more than ``tolerance`` above the beginning of the last one."""
     count = 1
     first[0] = 0
     begin = u[0]
@@ -178,9 +178,9 @@ def _merged(u: FloatArray, y: FloatArray, each: FloatArray, grain: float) -> Lev
     x = u[first[:-1]]
     rough = bool((u != np.repeat(x, size)).any())
     if rough:
-        # Relative to the first sample: a mean of large u would round to their last digit.
+        # Relative to the first sample: the mean of large u would lose digits by rounding.
         x = np.add.reduceat(each * (u - u[0]), first[:-1]) / weight
-    # Two lines' worth of digits are kept by never adding an offset back.
+    # The offsets are not added back, because that would lose digits.
     dx = x - float((weight * (x - x[0])).sum() / total + x[0])
     dy = y - float((each * (y - y[0])).sum() / total + y[0])
     mean = np.add.reduceat(each * dy, first[:-1]) / weight
@@ -203,14 +203,14 @@ def _merged(u: FloatArray, y: FloatArray, each: FloatArray, grain: float) -> Lev
     )
 
 
-# A bound counts as reached within this share of the sum of squares about one line. It lies
-# ten times above the search's rounding: without it, exact ties (data without noise) would
-# all have to be looked at.
+# A bound is taken as reached within this fraction of the sum of squares about one line. It is
+# ten times the rounding of the search: without it all exact ties (data without noise) would
+# have to be evaluated.
 _SLACK = 2e-14
-# The search's own cost and the cost of its breaks, recomputed from the samples, agree
-# within this share of Omega(1), or the result is not called certified.
+# The result is certified if the search's own cost and the cost of its breaks, recomputed from
+# the samples, agree within this fraction of Omega(1).
 _AGREE = 1e-10
-# Below this many levels starting threads costs more than it gains.
+# With fewer levels the start of threads takes longer than they save.
 _SERIAL_BELOW = 20_000
 
 
@@ -221,8 +221,8 @@ class FittedPiece:
     Attributes
     ----------
     u_from, u_to : float
-        The piece's range in % MPa^m. A piece begins at its own first sample, as in
-        the paper, and ends where the next begins, so ranges join without gap.
+        The piece's range in % MPa^m. A piece begins at its first sample, as in the
+        paper, and ends where the next one begins, so there are no gaps.
     slope : float
         K_f in MW per unit of u.
     intercept : float
@@ -231,8 +231,8 @@ class FittedPiece:
     sse : float
         Sum of squared residuals in MW^2.
     slope_stderr, intercept_stderr : float
-        Standard errors for independent samples; NaN where two samples leave nothing
-        to judge them by.
+        Standard errors for independent samples; NaN for two samples, which have no
+        residual.
     """
 
     u_from: float
@@ -253,20 +253,20 @@ class Partition:
     ----------
     cost : float64 (J_max,)
         Omega(J) of eq. (19) in MW^2, recomputed in two passes from the samples.
-        Where the smallest piece binds, it can rise with J.
+        Due to the minimum size of pieces it can rise with J.
     u, y, weight : float64 (n,)
         The samples in ascending order of u, and their weights; read-only.
     starts : tuple of int64 arrays
-        For each J the first sample of each piece, and n.
+        For each J the index of the first sample of each piece, and n.
     n_distinct : int
         Number of different u.
     certified : bool
-        The search's own costs agree with `cost`. With exact lower bounds this means:
-        no partition costs less than ``cost[J - 1] - tolerance``.
+        True if the search's own costs agree with `cost`. As the lower bounds are exact, no
+        partition then costs less than ``cost[J - 1] - tolerance``.
     floor : float
-        Costs up to here, in MW^2, are rounding of the samples themselves.
+        Costs up to this value, in MW^2, are rounding of the samples.
     limited : str
-        Why there are fewer partitions than asked for, as a sentence; else empty.
+        Why there are fewer partitions than requested, as a sentence; else empty.
     """
 
     cost: FloatArray
@@ -286,11 +286,11 @@ class Partition:
 
     @property
     def tolerance(self) -> float:
-        """Return in MW^2 how far a certified cost may lie above the optimum."""
+        """Return the maximum difference of a certified cost from the optimum, MW^2."""
         return _AGREE * float(self.cost[0])
 
     def breaks(self, pieces: int) -> IntArray:
-        """Return where the pieces begin among the sorted samples, and n: int64 (pieces + 1,)."""
+        """Return the indices of the first samples of the pieces, and n: int64 (pieces + 1,)."""
         if not 1 <= pieces <= len(self.starts):
             raise DataError(
                 f'There is no partition into {pieces} pieces, only into 1 to {len(self.starts)}.'
@@ -316,45 +316,45 @@ def partition(
     weight: ArrayLike | None = None,
     threads: int | None = None,
 ) -> Partition:
-    """Partition samples into 1 .. ``max_pieces`` straight pieces, each exactly.
+    """Partition samples exactly into 1, 2, ... ``max_pieces`` straight pieces.
 
     Parameters
     ----------
     u, y : array_like (n,)
         Integrated input in % MPa^m and power in MW, in any order; not changed.
     max_pieces : int
-        Largest J, R_max of the paper, at least 1. Fewer come out, and `Partition.limited`
-        says so, when there are fewer than ``max_pieces * min_distinct`` distinct u.
+        Largest J, R_max of the paper, at least 1. The result has fewer partitions, with a
+        reason in `Partition.limited`, for fewer than ``max_pieces * min_distinct`` distinct u.
     min_distinct : int
-        Fewest distinct u in a piece, at least 2: with one, a piece has no slope.
+        Minimum number of distinct u in a piece, at least 2: with one, a piece has no slope.
     weight : array_like (n,), optional
-        Of each sample's square in the cost, between 1e-6 and 1e6; 1 without it.
+        Weight of each sample's square in the cost, between 1e-6 and 1e6; default 1.
     threads : int, optional
-        1 starts none. By default as many as the process may use, for large inputs.
-        The result does not depend on it.
+        1 starts no threads. By default all available cores are used for large inputs.
+        The result does not depend on the number of threads.
 
     Raises
     ------
     DataError
-        The arrays do not match, hold something that is not a finite number or no
-        weight, or u never changes.
+        The lengths differ, a value is not a finite number or no valid weight, or u is
+        constant.
     TooFewSamplesError
-        There are fewer distinct u than one piece needs.
+        There are too few distinct u for one piece.
     ParameterError
         ``max_pieces``, ``min_distinct`` or ``threads`` is too small.
 
     Notes
     -----
-    Departures from the paper: equal u are merged before the search; a piece holds at
+    Differences from the paper: equal u are merged before the search; a piece has at
     least ``min_distinct`` distinct u; a sample belongs to one piece only (in eqs.
     (21)-(23) the sample at a break ends one piece and begins the next); u closer than
-    1e-9 of the range count as equal, also for the breaks.
+    1e-9 of the range are taken as equal, also for the breaks.
 
-    Among partitions of equal cost any one may come out: the cost is unique, the breaks
-    are not.
+    Any one of several partitions of equal cost may be returned: the cost is unique,
+    the breaks are not.
 
     Time grows slightly faster than n for each J in practice, O(J n^2) at worst; memory
-    is about 300 bytes a sample for 10 pieces.
+    is about 300 bytes per sample for 10 pieces.
     """
     _at_least('max_pieces', max_pieces, 1)
     _at_least('min_distinct', min_distinct, 2)
@@ -384,9 +384,9 @@ def partition(
 
 
 def _agree(levels: Levels, found: FloatArray, cost: FloatArray, starts: list[IntArray]) -> bool:
-    """Say whether the search's costs are those of its breaks; rounding gone wrong shows here."""
+    """Return True if the search's costs agree with those of its breaks, as a check of rounding."""
     if levels.rough:
-        # The search takes nearly equal u for equal: judge it on the problem it solved.
+        # The search takes nearly equal u as equal: compare costs of the problem that it solved.
         flat = np.repeat(levels.x, np.diff(levels.first))
         cost = np.array([_cost(flat, levels.y, levels.each, levels.first[s]) for s in starts])
     claimed = found * levels.scale**2 + levels.within

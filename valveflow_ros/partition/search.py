@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """One layer of the exact search: the best last break for every end.
 
-Ends are taken a group at a time, from left to right within a run of groups. A
-group first tries the breaks that were best for the group before it, which
-nearly always are best again, and then goes through all candidate breaks from
-right to left, a node of the tree at a time. A node whose lower bound
-(`partition.bounds`) is no better than what is known for any end of the group
-is passed over; otherwise its children are looked at, and of a leaf every
-single candidate, first by the same kind of bound and only then end by end.
+Ends are processed in groups, from left to right within a run of groups. A group
+first tries the breaks that were best for the previous group, which usually are
+best again. Then it tests all candidate breaks from right to left, one node of
+the tree at a time. A node is skipped if its lower bound (`partition.bounds`) is
+not better than the known cost for any end of the group. Otherwise its children
+are tested, and in a leaf every single candidate, first by the same kind of bound
+and then for each end.
 
-The moments of the core, from the end of the current node to the beginning of
-the group, are carried along and only ever added to.
+The moments of the core, from the end of the current node to the beginning of the
+group, are updated by additions only.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ from valveflow_ros.partition.moments import (
 )
 from valveflow_ros.records import FloatArray, IntArray
 
-# Breaks that the first group of a run begins with, for lack of a group before it.
+# Initial breaks of the first group of a run, which has no previous group.
 _FIRST_SEEDS = 48
-# How many times longer the core must be before the tail's reference line is renewed.
+# Growth factor of the core after which the tail's reference line is updated.
 _RENEW = 4.0
 
 
 class Layer(NamedTuple):
-    """What the search of one layer reads, besides the tree.
+    """The inputs of the search of one layer, besides the tree.
 
     Attributes
     ----------
@@ -68,13 +68,13 @@ class Layer(NamedTuple):
     shortest : int
         Smallest number of samples in a piece.
     slack : float
-        A bound counts as reached when it comes within ``slack`` >= 0.
+        A bound is taken as reached within ``slack`` >= 0.
     limit : float
-        Reference lines do not leave ``[-limit, limit]``.
+        Reference lines stay within ``[-limit, limit]``.
     near : Near
     prior : float64 (nodes, SLOTS, 5)
     before : float64 (ends,)
-        Costs of the layer before, indexed by end.
+        Costs of the previous layer, indexed by end.
     bound : float64 (nodes, SLOTS, 5)
     """
 
@@ -92,7 +92,7 @@ class Layer(NamedTuple):
 def _mark_candidates(
     tree: Tree, layer: Layer, block: int, core: Moments, shift: float, group: Group
 ) -> int:
-    """Flag a leaf's candidates whose bound leaves room for improvement; return how many."""
+    """Mark a leaf's candidates whose bound permits an improvement; return their number."""
     t = tree.leaf[block]
     a, b, lo1, hi1, lo2, hi2, least, width = (
         group.line[0], group.line[1], group.line[2], group.line[3],
@@ -129,11 +129,11 @@ def _mark_candidates(
 def _search_leaf(
     tree: Tree, layer: Layer, block: int, leaf: int, core: Moments, group: Group
 ) -> None:
-    """Try the breaks of one leaf on the ends of the group that begins at ``block``."""
+    """Try the breaks of one leaf for the ends of the group that begins at ``block``."""
     shift = tree.x[LEAF * block - 1] - tree.x[LEAF * leaf + LEAF - 1]
     kept = _mark_candidates(tree, layer, leaf, core, shift, group)
     if kept > 2 and leaf < block - 1:
-        # A reference line of these very candidates leaves less to the box of slopes.
+        # A reference line from these candidates makes the box of slopes smaller.
         _, value, slope, firm = fit(joined(leaf_moments(tree, leaf, LEAF // 2), shift, core))
         if firm:
             bound_about_line(group, core, value, slope, layer.limit)
@@ -156,7 +156,7 @@ def _node_part(
     tree: Tree, layer: Layer, level: int, end: int, size: int, wide: int, right: float,
     slope: float,
 ) -> float:  # fmt: skip
-    """Lower bound of a node's part about the core's line, whose value at its end is ``right``."""
+    """Return a lower bound of a node's part about the core's line, which ends at ``right``."""
     number = tree.start[level] + end // size - 1
     slot = min(wide - level, SLOTS - 1) if wide > level else 0
     b = layer.bound[number, slot]
@@ -170,7 +170,7 @@ def _node_part(
 
 @kernel
 def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
-    """Go through all breaks left of a group, near ones first; return the leaves opened."""
+    """Test all breaks left of a group, near ones first; return the number of leaves opened."""
     origin = tree.x[LEAF * block - 1]
     core = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     end = block
@@ -199,7 +199,7 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
         rest = cost + layer.slack + tail_part(group, value, slope)
         while True:
             part = _node_part(tree, layer, level, end, size, wide, right, slope)
-            # Without a line of the core there is nothing to bound about.
+            # Without a line of the core there is no bound.
             drop = firm and part + rest >= 0.0
             if drop or level == 0:
                 break
@@ -218,7 +218,7 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
 def _try_breaks(
     tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, group: Group
 ) -> None:
-    """Try the breaks that were best for the group before this one."""
+    """Try the breaks that were best for the previous group."""
     for q in range(count):
         break_ = seeds[q]
         m = stretch_moments(tree, break_, block)
@@ -228,7 +228,7 @@ def _try_breaks(
 
 @inlined
 def _collect_breaks(group: Group, seeds: IntArray) -> int:
-    """Collect the different breaks of a group; return how many."""
+    """Collect the different breaks of a group; return their number."""
     count = 0
     last = -1
     for k in range(LEAF):
@@ -253,14 +253,14 @@ def search_groups(
     Parameters
     ----------
     after : float64 (ends,)
-        Cost of the best ``layer.pieces`` pieces up to each end; inf where impossible.
+        Cost of the best ``layer.pieces`` pieces up to each end; inf if impossible.
     breaks : int32 (ends,)
-        Where the last of them begins; -1 where impossible.
+        First sample of the last piece; -1 if impossible.
 
     Returns
     -------
     int
-        How many leaves were opened: what the bounds could not decide.
+        Number of leaves opened, which the bounds could not exclude.
     """
     group = new_group()
     seeds = np.empty(_FIRST_SEEDS + LEAF, np.int64)
@@ -289,16 +289,16 @@ def search_groups(
     return leaves
 
 
-# All layers of the exact dynamic programme, and the way back through them.
+# All layers of the exact dynamic programme, and the backtracking.
 
 
-# Groups that one thread searches before it asks for more. Fixed, so that the
-# result does not depend on the number of threads.
+# Groups in one task of a thread. The number is fixed, so that the result does
+# not depend on the number of threads.
 _RUN = 64
 
 
 class Problem(NamedTuple):
-    """A prepared search: the tree and all else that does not depend on the layer."""
+    """A prepared search: the tree and all other data that do not depend on the layer."""
 
     tree: Tree
     near: Near
@@ -367,8 +367,8 @@ def _fill_first(tree: Tree, shortest: int, first: int, last: int, after: FloatAr
 def layers(problem: Problem, pieces: int) -> Iterator[tuple[FloatArray, NDArray[np.int32]]]:
     """Yield for 1, 2, ... ``pieces`` pieces the best cost up to each end, and the last break.
 
-    Of the last layer only the end ``n`` is worked out; the array of costs is
-    used again two layers later. Costs are inf where an end cannot be reached.
+    In the last layer only the end ``n`` is computed. The array of costs is
+    reused two layers later. Costs are inf if an end cannot be reached.
     """
     tree, threads = problem.tree, problem.threads
     blocks = len(tree.leaf)
@@ -424,7 +424,7 @@ def best_partitions(problem: Problem, pieces: int) -> tuple[FloatArray, list[Int
     -------
     cost : float64 (pieces,)
     starts : list of int64 arrays
-        ``starts[j - 1]`` holds 0, the first samples of the other pieces, and n.
+        ``starts[j - 1]`` contains 0, the first samples of the other pieces, and n.
     """
     n = problem.tree.n
     cost = np.empty(pieces)

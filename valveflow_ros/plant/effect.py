@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What an effect is: a name, parameters with units and ranges, and a way to take hold."""
+"""Effects: a name, parameters with units and ranges, and a function that installs the effect."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from valveflow_ros.parameters import Parameter, Value
 from valveflow_ros.plant.unit import Region, UnitDescription
 from valveflow_ros.records import NS_PER_S, SIGNALS, FloatArray, Signal
 
-# The places of the plant where an effect may take hold.
+# The places of the plant at which an effect can act.
 
 DAY_S = 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
 class LoopInputs:
-    """Rows of the closed loop before it runs; all float64 (n,).
+    """Inputs of the closed loop for a part of a run; all float64 (n,).
 
     ``time_s`` counts from the first recorded row (the warm-up is negative),
-    ``clock_s`` from a midnight UTC. An effect writes into ``gain`` (factor on
+    ``clock_s`` from a midnight UTC. An effect may only change ``gain`` (factor on
     x = F(u)), ``input_gain`` (factor on u) and ``offset_mw`` (added to the
-    power), nowhere else.
+    power).
     """
 
     time_s: FloatArray
@@ -40,7 +40,7 @@ class LoopInputs:
 
 @dataclass(frozen=True, slots=True)
 class HistorianRows:
-    """Rows as the historian is about to keep them; columns are changed in place."""
+    """Rows before the historian stores them; columns are changed in place."""
 
     time_s: FloatArray
     columns: dict[Signal, FloatArray]
@@ -48,12 +48,12 @@ class HistorianRows:
 
 @dataclass(slots=True)
 class ActuatorLimits:
-    """What stands between two places of the actuator; the defaults let everything through.
+    """Limits between two points of the actuator; the defaults have no effect.
 
     Attributes
     ----------
     rate_percent_per_s : float
-        Fastest motion.
+        Maximum speed.
     band_percent, jump_percent : float
         Stick-slip parameters S and J.
     top_percent : float
@@ -71,7 +71,7 @@ class ActuatorLimits:
 
 @dataclass(frozen=True, slots=True)
 class AddedCurve:
-    """MW added to x as a piecewise-linear function of u from ``from_s`` on, level outside."""
+    """MW added to x as a piecewise-linear function of u from ``from_s`` on, constant outside."""
 
     u: FloatArray
     x_mw: FloatArray
@@ -80,11 +80,11 @@ class AddedCurve:
 
 @dataclass(slots=True)
 class Hooks:
-    """Everything effects can change, set up once for a run.
+    """All settings that effects can change, created once for a run.
 
-    The position sensor stands between the two banks: what happens in
-    ``before_sensor`` (from command to sensor) shows in the measured opening,
-    what happens in ``after_sensor`` (from sensor to plug) does not.
+    The position sensor is between the two banks: the measured opening shows the
+    effects of ``before_sensor`` (from command to sensor), but not those of
+    ``after_sensor`` (from sensor to plug).
 
     Attributes
     ----------
@@ -93,15 +93,15 @@ class Hooks:
     length_s : float
         Length of the recorded part.
     forcing : list of callables
-        Each changes the `LoopInputs` of every part of the run.
+        Each function changes the `LoopInputs` of every part of the run.
     writing : list of callables
-        Each changes what is `HistorianRows` of every part of the run.
+        Each function changes the `HistorianRows` of every part of the run.
     lead_s : float
-        How much earlier than the other signals the power is stamped.
+        Time by which the stamps of the power are earlier than those of other signals.
     kappa_mpa_per_mw, critical_ratio : float
         Back pressure per power (0: always choked) and critical pressure ratio.
     reheater_share, reheater_s : float
-        Share of the power made before the reheater, and its time constant.
+        Fraction of the power generated before the reheater, and its time constant.
     """
 
     unit: UnitDescription
@@ -121,7 +121,7 @@ class Hooks:
 
     @classmethod
     def of(cls, unit: UnitDescription, length_s: float) -> Hooks:
-        """Return hooks with nothing on them."""
+        """Return hooks without any effect."""
         return cls(unit, length_s, unit.regions)
 
     def bank(self, before_sensor: float) -> ActuatorLimits:
@@ -129,12 +129,12 @@ class Hooks:
         return self.before_sensor if before_sensor else self.after_sensor
 
     def claim(self, name: str, place: str = '') -> None:
-        """Say that a place that holds one setting only is taken.
+        """Reserve a place that can have one setting only.
 
         Raises
         ------
         InputError
-            It was taken before.
+            The place is already reserved.
         """
         key = f'{name} {place}'
         if key in self._claimed:
@@ -199,22 +199,22 @@ def _no_problem(values: Values) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """Something that can be wrong with a plant or with its record.
+    """A possible fault of a plant or of its record.
 
     Attributes
     ----------
     name : str
-        The catalogue's word for it.
+        Its name in the catalogue.
     summary : str
         One sentence.
     parameters : tuple of Parameter
-        Defaults are a middling amplitude: clearly there in ten days, hard to see by eye.
+        Defaults are a medium amplitude: detectable in ten days, hard to see by eye.
     install : callable
-        Takes the values and puts the effect on the `Hooks` of a run.
+        Installs the effect with these values in the `Hooks` of a run.
     starts_days : callable
-        When it begins to act; a run that ends before is refused.
+        Returns the time of its beginning; a run that ends before is refused.
     problem : callable
-        What is wrong with the values together, as the end of a sentence; empty if nothing.
+        Returns a conflict between the values, as the end of a sentence; empty if none.
     """
 
     name: str
@@ -231,5 +231,5 @@ def ramp(time_s: FloatArray) -> FloatArray:
 
 
 def step(time_s: FloatArray, values: Values) -> FloatArray:
-    """Return 0 before the onset and 1 from it on."""
+    """Return 0 before the onset and 1 after it."""
     return np.where(time_s >= values['t0_days'] * DAY_S, 1.0, 0.0)

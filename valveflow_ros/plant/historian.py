@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a historian keeps of the signals of a plant: every value, means, or exceptions."""
+"""The values of a plant's signals that a historian stores: all, means, or exceptions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from valveflow_ros.plant.thermal_unit import assignments
 from valveflow_ros.records import NS_PER_S, BoolArray, FloatArray, IntArray
 
 RECORDINGS = ('1s', 'minute', 'compressed')
-# Spans of the transmitters, from which a dead band in % is counted; a position has 100 %.
+# Spans of the transmitters, to which a dead band in % refers; that of a position is 100 %.
 SPANS = {
     'main_steam_pressure_mpa': 25.0,
     'main_steam_temperature_degc': 600.0,
@@ -39,19 +39,19 @@ class Historian:
     ----------
     recording : str
         '1s': every sample. 'minute': the mean of each full minute of the record, stamped at
-        its end. 'compressed': a value is kept when a scan finds it farther than the dead band
-        from the last one kept, or that one too old.
+        its end. 'compressed': a value is stored if a scan finds that it differs by more than
+        the dead band from the last stored one, or that the last one is too old.
     band_percent : float
         Dead band, % of the span in `SPANS`.
     scan_low_s, scan_high_s : float
-        Each signal has a scan interval of whole seconds of its own, drawn between these.
+        Each signal has its own scan interval in whole seconds, random between these limits.
     longest_s : float
-        A value is kept at the last scan before this time since the last one kept is over.
+        Maximum time between stored values; it is rounded down to a scan.
     resample_s : float
-        Of a compressed record: 0 gives each value at its own time; otherwise whole seconds
-        between rows that hold the last value kept, from where each signal has one.
+        For a compressed record: 0 gives each value at its own time; otherwise the step in whole
+        seconds of rows with the last stored values, from the time when all signals have one.
     dropouts_per_day, dropout_minutes : float
-        How often a signal is missing, and for how long on average.
+        Number of dropouts of a signal per day, and their mean duration.
     """
 
     recording: str = '1s'
@@ -64,7 +64,7 @@ class Historian:
     dropout_minutes: float = 30.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no way to record."""
+        """Check the options."""
         if self.recording not in RECORDINGS:
             raise InputError(
                 f"There is no recording '{self.recording}': use one of {', '.join(RECORDINGS)}."
@@ -93,7 +93,7 @@ class Historian:
 
     @classmethod
     def parse(cls, text: str) -> Historian:
-        """Read ``NAME`` or ``NAME:key=value,...``, the keys being the attributes.
+        """Read ``NAME`` or ``NAME:key=value,...``; the keys are the attributes.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class Historian:
 
     @property
     def own_times(self) -> bool:
-        """Return whether each value has a time of its own, and empty cells mean no new value."""
+        """Return True if each value has its own time, so that an empty cell means no new value."""
         return self.recording == 'compressed' and self.resample_s == 0.0
 
     def record(
@@ -119,16 +119,16 @@ class Historian:
         start_ns : int
             Time of the first sample.
         signals : mapping of str to float64 (n,)
-            By column; not changed.
+            Signals by column; not changed.
         rng : numpy.random.Generator
-            Draws scans and dropouts, the same number for any recording.
+            Used for scans and dropouts; the number of draws is the same for all recordings.
 
         Returns
         -------
         time_ns : int64 (m,)
             Increasing.
         columns : dict of float64 (m,)
-            NaN where a value is missing or, with times of their own, where there is none.
+            NaN if a value is missing or, with own times, if there is no new value.
         """
         there = self._there(signals, rng)
         scans = self._scans(signals, rng)
@@ -153,10 +153,10 @@ class Historian:
     def _there(
         self, signals: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> dict[str, FloatArray]:
-        """Return the signals with NaN where they drop out."""
+        """Return the signals with NaN in dropouts."""
         n, out = _length(signals), {}
         for name, column in signals.items():
-            # Signals have generators of their own: more dropouts of one move no other.
+            # Each signal has its own generator: dropouts of one do not change those of another.
             mine = np.random.default_rng(rng.integers(2**63))
             out[name] = column
             if self.dropouts_per_day == 0.0:
@@ -184,7 +184,7 @@ class Historian:
     def _rows(
         self, signals: dict[str, FloatArray], kept: dict[str, BoolArray]
     ) -> tuple[IntArray, dict[str, FloatArray]]:
-        """Return a row for each second at which anything was kept, or evenly spaced rows."""
+        """Return a row for each second with any stored value, or equally spaced rows."""
         if self.own_times:
             anything = np.any(list(kept.values()), axis=0)
             seconds = np.flatnonzero(anything).astype(np.int64)
@@ -194,7 +194,7 @@ class Historian:
             }
             return seconds, columns
         step = round(self.resample_s)
-        # One that is missing throughout is not waited for.
+        # Do not wait for a signal that is always missing.
         begin = max((int(np.argmax(k)) for k in kept.values() if k.any()), default=0)
         seconds = np.arange(-(-begin // step) * step, _length(signals), step, dtype=np.int64)
         columns = {}
@@ -211,7 +211,7 @@ def _length(signals: Mapping[str, FloatArray]) -> int:
 
 
 def _minutes(signals: dict[str, FloatArray]) -> tuple[IntArray, dict[str, FloatArray]]:
-    """Return the means of full minutes, of what is there, stamped at the end of each."""
+    """Return the means of the values in full minutes, stamped at the end of each minute."""
     count = _length(signals) // _MINUTE
     columns = {}
     for name, column in signals.items():
@@ -224,10 +224,10 @@ def _minutes(signals: dict[str, FloatArray]) -> tuple[IntArray, dict[str, FloatA
 
 @kernel
 def exceptions(column: FloatArray, scan: int, phase: int, band: float, longest: int) -> BoolArray:
-    """Return which samples exception compression keeps, bool (n,).
+    """Return a mask of the samples that exception compression stores, bool (n,).
 
-    Only every ``scan``-th sample from ``phase`` on is looked at. A scan that finds no value
-    keeps none, and the next one that finds one keeps it.
+    Only every ``scan``-th sample from ``phase`` on is tested. If a scan finds no value,
+    the next value found is stored.
     """
     kept = np.zeros(column.size, dtype=np.bool_)
     last, since = np.nan, 0

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop of valve, turbine and power control, one step after the other."""
+"""The closed loop of valve, turbine and power control, step by step."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from valveflow_ros.plant.effect import ActuatorLimits, AddedCurve, Hooks
 from valveflow_ros.plant.unit import Region
 from valveflow_ros.records import FloatArray
 
-# The actuator's faults as operators on a moving position, one sample after the other.
+# The actuator's faults as operators on a moving position, sample by sample.
 
 
-# One remembered position each: after the rate limit, the stick-slip, the slack.
+# Stored positions: after the rate limit, after the stick-slip, after the slack.
 N_POSITIONS = 3
 
 
 def settings(bank: ActuatorLimits, step_s: float) -> FloatArray:
-    """Return what `move` wants: largest step, slip-off and slip-to distance, top, half slack."""
+    """Return the settings of `move`: largest step, slip-off, slip-to, top, half slack."""
     off = (bank.band_percent + bank.jump_percent) / 2.0
     to = (bank.band_percent - bank.jump_percent) / 2.0
     return np.array(
@@ -48,7 +48,7 @@ def rate_limited(wanted: float, before: float, largest: float) -> float:
 
 @jit
 def stick_slip(wanted: float, before: float, off: float, to: float) -> float:
-    """Stay until the pull exceeds ``off`` = (S + J)/2, then slip to ``to`` = (S - J)/2 from it.
+    """Stay until the distance exceeds ``off`` = (S + J)/2, then slip to ``to`` = (S - J)/2.
 
     He's two-parameter form of the stick band S and the slip jump J; without a
     jump it is a dead band of width S.
@@ -63,13 +63,13 @@ def stick_slip(wanted: float, before: float, off: float, to: float) -> float:
 
 @jit
 def play(wanted: float, before: float, half: float) -> float:
-    """Follow only when pushed by either flank of a slack of width ``2 half``."""
+    """Follow only if pushed by one of the two sides of a slack of width ``2 half``."""
     return min(max(before, wanted - half), wanted + half)
 
 
 @jit
 def move(wanted: float, positions: FloatArray, bank: FloatArray) -> float:
-    """Return where a bank lets the position go, remembering its inner positions.
+    """Return the position after a bank, and update its stored positions.
 
     Servo first, then the friction of the stem, its upper stop, the slack of the linkage.
     """
@@ -79,15 +79,15 @@ def move(wanted: float, positions: FloatArray, bank: FloatArray) -> float:
     return float(positions[2])
 
 
-# First-order lags with delay, exact for an input that is straight between two samples.
+# First-order lags with delay, exact for an input that is linear between two samples.
 
 
 def lag_coefficients(time_s: float, step_s: float) -> tuple[float, float, float]:
     """Return (a, b, c) of ``y[t] = a y[t-1] + b x[t-1] + c x[t]``; a time of 0 is no lag.
 
-    The paper gives G_i in continuous time, eq. (31). Between two samples the
-    input of a valve on a ramp is straight, so a ramp is answered late by
-    exactly T + tau at any sample period, as eq. (13) says.
+    The paper gives G_i in continuous time, eq. (31). The input of a valve on a ramp
+    is linear between two samples, so the response to a ramp lags by exactly
+    T + tau at any sample period, as in eq. (13).
     """
     if time_s == 0.0:
         return 0.0, 0.0, 1.0
@@ -97,7 +97,7 @@ def lag_coefficients(time_s: float, step_s: float) -> tuple[float, float, float]
 
 
 def lag_table(regions: tuple[Region, ...], step_s: float) -> tuple[FloatArray, int]:
-    """Return rows (power_to, a, b, c, delay in samples) and how many past samples they need."""
+    """Return rows (power_to, a, b, c, delay in samples) and the number of past samples needed."""
     rows = [
         (r.power_to_mw, *lag_coefficients(r.time_constant_s, step_s), r.delay_s / step_s)
         for r in regions
@@ -115,7 +115,7 @@ def _late(flow: FloatArray, now: int, delay: float) -> float:
 
 @jit
 def answer(flow: FloatArray, now: int, before: float, lags: FloatArray) -> float:
-    """Return the answer of G_i at ``now``, i being the region of the present flow, eq. (3)."""
+    """Return the response of G_i at ``now`` for the region i of the present flow, eq. (3)."""
     i = 0
     while i < lags.shape[0] - 1 and flow[now] >= lags[i, 0]:
         i += 1
@@ -124,19 +124,19 @@ def answer(flow: FloatArray, now: int, before: float, lags: FloatArray) -> float
     return float(lags[i, 1] * before + lags[i, 2] * old + lags[i, 3] * new)
 
 
-# From the plug's opening to steam power: eqs. (1) and (2), and what effects change in them.
+# From the plug's opening to steam power: eqs. (1) and (2), with the changes by effects.
 
 
-# Beyond it the ellipse would end in no flow at all.
+# Above this ratio the ellipse would give almost no flow.
 _LARGEST_RATIO = 0.98
 
 
 class FlowLaw(NamedTuple):
-    """The curve, what is added to it, and the nozzle.
+    """The curve, the added curves, and the nozzle.
 
     ``added_u``, ``added_x`` (k, m) and ``added_from_s`` (k,) are curves on top
-    of F; ``nozzle`` is (kappa, critical ratio, and the sliding pressure as
-    pressure at no load and rise per MW).
+    of F; ``nozzle`` is (kappa, critical ratio, sliding pressure at no load, rise
+    of the sliding pressure per MW).
     """
 
     curve_u: FloatArray
@@ -148,7 +148,7 @@ class FlowLaw(NamedTuple):
 
 
 def _same_length(curves: list[AddedCurve]) -> tuple[FloatArray, FloatArray]:
-    """Return curves as two tables; short ones get further points on their level end."""
+    """Return curves as two tables; short ones are extended by points on their constant end."""
     m = max((c.u.size for c in curves), default=2)
     u, x = np.zeros((len(curves), m)), np.zeros((len(curves), m))
     for k, curve in enumerate(curves):
@@ -171,7 +171,7 @@ def flow_law(hooks: Hooks) -> FlowLaw:
 
 @jit
 def interpolate(x: float, xs: FloatArray, ys: FloatArray) -> float:
-    """Interpolate linearly; beyond the ends the outer pieces go on."""
+    """Interpolate linearly; the outer pieces extend beyond the ends."""
     k = 0
     while k < xs.size - 2 and x >= xs[k + 1]:
         k += 1
@@ -180,7 +180,7 @@ def interpolate(x: float, xs: FloatArray, ys: FloatArray) -> float:
 
 @jit
 def subcritical_factor(ratio: float, critical: float) -> float:
-    """Return the flow relative to the choked flow at a pressure ratio behind/before."""
+    """Return the flow relative to the choked flow at a pressure ratio (after / before)."""
     if ratio <= critical:
         return 1.0
     share = (min(ratio, _LARGEST_RATIO) - critical) / (1.0 - critical)
@@ -189,7 +189,7 @@ def subcritical_factor(ratio: float, critical: float) -> float:
 
 @jit
 def nozzle_factor(x: float, pressure: float, nozzle: FloatArray) -> float:
-    """Return what the pressure behind the valve makes of u, against the sliding line."""
+    """Return the factor on u by the pressure after the valve, relative to the sliding line."""
     kappa, critical = nozzle[0], nozzle[1]
     if kappa == 0.0:
         return 1.0
@@ -211,7 +211,7 @@ def added(
 
 
 class Series(NamedTuple):
-    """What drives the loop; float64 (n,) each.
+    """The inputs of the loop; float64 (n,) each.
 
     ``density`` is p^m, ``noise`` the disturbance of the power in MW, the rest
     as in `Outside` and `Forcing`.
@@ -229,7 +229,7 @@ class Series(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the loop did; float64 (n,) each: %, %, %, % MPa^m, MW."""
+    """The outputs of the loop; float64 (n,) each: %, %, %, % MPa^m, MW."""
 
     command: FloatArray
     sensor: FloatArray
@@ -239,11 +239,11 @@ class Motion(NamedTuple):
 
 
 class Law(NamedTuple):
-    """What stays the same during a run.
+    """The constants of a run.
 
-    ``control`` is (share of the error corrected per step or 0, limit of u, off
-    above MW, share let go per step, manual or 0), ``lags`` the table of `lag_table`,
-    ``reheater`` is (share after it, a, b before, b now).
+    ``control`` is (fraction of the error corrected per step or 0, limit of u, off
+    above MW, fraction forgotten per step, manual or 0), ``lags`` the table of `lag_table`,
+    ``reheater`` is (fraction after it, a, b before, b now).
     """
 
     flow: FlowLaw
@@ -255,7 +255,7 @@ class Law(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the loop remembers: (correction, power before the reheater, behind it), positions."""
+    """The state of the loop: (correction, power before the reheater, after it), positions."""
 
     state: FloatArray
     before_sensor: FloatArray
@@ -266,7 +266,7 @@ class Memory(NamedTuple):
 def _command(
     load: float, move: float, density: float, correction: float, flow: FlowLaw, manual: float
 ) -> float:
-    """Return the opening the controller asks for, in %."""
+    """Return the opening that the controller commands, in %."""
     wanted = move
     if manual == 0.0:
         u = interpolate(load, flow.curve_x, flow.curve_u) + correction
@@ -276,12 +276,12 @@ def _command(
 
 @jit
 def _corrected(correction: float, load: float, error: float, control: FloatArray) -> float:
-    """Let the power control integrate its error in MW into a correction of u."""
+    """Integrate the error of the power control in MW to a correction of u."""
     if control[0] == 0.0:
         return correction
     if load < control[2]:
         return float(min(max(correction + control[0] * error, -control[1]), control[1]))
-    # On the flat end an integrator would wind up: it is let go.
+    # Prevent integrator windup at the flat end: reduce the correction.
     return float(correction * (1.0 - control[3]))
 
 
@@ -319,7 +319,7 @@ def _run(series: Series, law: Law, memory: Memory, flow: FloatArray, out: FloatA
 
 
 class ClosedLoop:
-    """Valve, turbine and power control, run part by part; begins in equilibrium."""
+    """Valve, turbine and power control, run part by part; it begins in steady state."""
 
     def __init__(self, hooks: Hooks, manual: bool) -> None:
         lags, self._depth = lag_table(hooks.regions, hooks.unit.sample_period_s)
@@ -338,7 +338,7 @@ class ClosedLoop:
         return Motion(*out)
 
     def _begin(self, series: Series) -> Memory:
-        """Return the state of a plant that has stood at the first load for ever."""
+        """Return the steady state of a plant at the first load."""
         load = float(series.load[0])
         self._past = np.full(self._depth, load)
         opening = _command(
@@ -349,7 +349,7 @@ class ClosedLoop:
 
 
 def _law(hooks: Hooks, lags: FloatArray, manual: bool) -> Law:
-    """Collect what stays the same during a run."""
+    """Return the constants of a run."""
     plan, h = hooks.unit.programme, hooks.unit.sample_period_s
     share = h / plan.feedback_s if plan.feedback and not manual else 0.0
     control = (

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The whole plant with its instruments, row after row."""
+"""The whole plant with its instruments, row by row."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from valveflow_ros.plant.loop import ClosedLoop, Series
 from valveflow_ros.plant.unit import Programme, UnitDescription
 from valveflow_ros.records import FloatArray
 
-# Random numbers and filters that go on from part to part.
+# Random numbers and filters with a state that continues from part to part.
 #
-# Each source of chance has a generator of its own, made from the seed and the
-# number of the source. So a longer run begins with the shorter one, a run cut
-# into parts equals the run in one piece, and nothing that is switched on takes
-# numbers away from anything else.
+# Each random source has its own generator, made from the seed and the number of
+# the source. So a longer run begins with the shorter one, a run in parts equals
+# the run in one piece, and an effect does not change the random numbers of other
+# sources.
 
 
 class ChanceSource(enum.IntEnum):
-    """The sources of chance; a number once given is never used for another."""
+    """The random sources; the number of a source is never used for another one."""
 
     LOAD = 1
     PULSES = 2
@@ -73,7 +73,7 @@ class Wander:
 
 
 class LowPass:
-    """A first-order lag that starts in equilibrium with the first value it meets."""
+    """A first-order lag that starts in steady state with its first value."""
 
     def __init__(self, time_s: float, step_s: float) -> None:
         self._decay = float(np.exp(-step_s / time_s))
@@ -90,20 +90,20 @@ class LowPass:
         return np.asarray(out)
 
 
-# The outside of the unit: load programme, pressure, temperature, fast valve moves.
+# Inputs from outside the unit: load programme, pressure, temperature, fast valve moves.
 
 PULSE_EDGE_S = 4.0
 PULSE_HOLD_S = (30.0, 120.0)
-# Spraying follows a change of load: the temperature falls by this much per MW/min.
+# Spray water reacts to a change of load: the temperature falls by this much per MW/min.
 _TEMPERATURE_DIP_K = 0.3
 _TEMPERATURE_DIP_S = 300.0
 
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """What acts on the unit, row by row; all float64 (n,).
+    """The inputs of the unit from outside, row by row; all float64 (n,).
 
-    ``moves_percent`` is added to the opening that the load asks for; under a
+    ``moves_percent`` is added to the opening that the load requires; with a
     manual drive it is the opening itself.
     """
 
@@ -114,14 +114,14 @@ class Outside:
 
 
 class Drive(Protocol):
-    """Somebody who drives the unit."""
+    """The operation of the unit: load programme or manual opening."""
 
     @property
     def manual(self) -> bool:
-        """Whether the opening is set by hand, the power control being off."""
+        """Return True if the opening is set by hand and the power control is off."""
 
     def advance(self, first: int, count: int) -> Outside:
-        """Return rows ``[first, first + count)``; to be called for rows in their order."""
+        """Return rows ``[first, first + count)``; must be called in the order of the rows."""
 
 
 def load_knots(
@@ -129,9 +129,9 @@ def load_knots(
 ) -> tuple[FloatArray, FloatArray]:
     """Return corner points of the load set point: seconds and MW, holds and linear ramps.
 
-    Targets follow a daily sine that is at its mean, rising, at 09:00, and now
-    and then sit at full load, where the curve is flat. ``clock_s`` is the time
-    of day at second 0.
+    Targets follow a daily sine with its rising zero crossing at 09:00, and are
+    sometimes at full load, where the curve is flat. ``clock_s`` is the time of
+    day at second 0.
     """
     knots_s, knots_mw = [0.0], [plan.load_mean_mw]
     while knots_s[-1] < length_s:
@@ -172,7 +172,7 @@ class Pulses:
         return cls(start, hold, height_percent)
 
     def at(self, times_s: FloatArray) -> FloatArray:
-        """Return their sum in % at evenly spaced times, shape (n,)."""
+        """Return their sum in % at equally spaced times, shape (n,)."""
         added = np.zeros_like(times_s)
         if times_s.size == 0:
             return added
@@ -188,7 +188,7 @@ class Pulses:
 
 
 class LoadProgramme:
-    """The unit under power control, as section IV of the paper and a grid would drive it."""
+    """The unit under power control, as in section IV of the paper and with frequency control."""
 
     def __init__(self, unit: UnitDescription, seed: int, length_s: float, clock_s: float) -> None:
         plan, h = unit.programme, unit.sample_period_s
@@ -206,7 +206,7 @@ class LoadProgramme:
 
     @property
     def manual(self) -> bool:
-        """The power control is on."""
+        """Return False, because the power control is on."""
         return False
 
     def advance(self, first: int, count: int) -> Outside:
@@ -227,10 +227,10 @@ class LoadProgramme:
 
 
 class PlantRows(NamedTuple):
-    """What happened and what the instruments showed; float64 (n,) each.
+    """The true and the measured values; float64 (n,) each.
 
-    ``*_read`` are values with the sensors' noise, not rounded; ``power`` is
-    free of noise and ``noise`` is what a meter shows on top of it.
+    ``*_read`` are values with the sensors' noise, not rounded; ``power`` has
+    no noise, and the measured power is ``power`` plus ``noise``.
     """
 
     command: FloatArray
@@ -253,7 +253,7 @@ class PlantRows(NamedTuple):
 
 
 class Disturbance:
-    """The noise of the power: a slow part, a white part, and more where asked for."""
+    """The noise of the power: a slow part, a white part, and optional further parts."""
 
     def __init__(self, unit: UnitDescription, seed: int) -> None:
         h, self._noise, self._plan = unit.sample_period_s, unit.noise, unit.programme
@@ -263,7 +263,7 @@ class Disturbance:
         self._white = generator(seed, ChanceSource.WHITE_NOISE)
 
     def advance(self, load_mw: FloatArray) -> FloatArray:
-        """Return the next values in MW, one a row of the load."""
+        """Return the next values in MW, one per row of the load."""
         noise, plan, n = self._noise, self._plan, load_mw.size
         sum_mw = noise.slow_mw * self._slow.advance(n)
         sum_mw += noise.white_mw * self._white.standard_normal(n)
@@ -276,7 +276,7 @@ class Disturbance:
 
 
 class Plant:
-    """A unit, somebody who drives it, its effects and its instruments.
+    """A unit, its drive, its effects and its instruments.
 
     ``first_row`` is the number of the first row, the first recorded one being
     0; ``clock_s`` is the time of day of row 0.

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a unit for some days and return what its instruments would have written."""
+"""Simulate a unit for some days and return the record of its instruments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from valveflow_ros.plant.spec import EffectSpec, install
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, FloatArray, SampleTable, Signal
 
-# What the historian keeps of a plant: stamps, rounding, faults of the record.
+# The historian's record of a plant: stamps, rounding, faults of the record.
 
 DECIMALS = {
     Signal.VALVE_OPENING: 2,
@@ -30,19 +30,19 @@ DECIMALS = {
 
 @dataclass(frozen=True, slots=True)
 class SimulatedLog:
-    """What the instruments wrote, and the truth behind it.
+    """The record of the instruments, and the true values.
 
-    Where the power is stamped early or late (`clock`), its truth and its
-    noise stand in the rows where it was stamped. So but for faults of the
-    record, the power in the table is ``true_power_mw + noise_mw``, rounded.
+    If the power is stamped early or late (`clock`), its true value and its
+    noise are in the rows of the stamps. So without faults of the record, the
+    power in the table is ``true_power_mw + noise_mw``, rounded.
 
     Attributes
     ----------
     table : SampleTable
-        Opening, pressure, temperature, power and command, rounded as a historian does.
-        The command is the output of the controller, before anything in the actuator.
+        Opening, pressure, temperature, power and command, rounded as in a historian.
+        The command is the output of the controller, before the actuator.
     true_u : float64 (n,)
-        The integrated input that really acted on the curve, % MPa^m.
+        The true integrated input of the curve, % MPa^m.
     true_power_mw : float64 (n,)
         Power without noise.
     load_mw : float64 (n,)
@@ -50,11 +50,11 @@ class SimulatedLog:
     unit : UnitDescription
         The unit that was simulated, without its effects.
     noise_mw : float64 (n,)
-        The disturbance of the power that was drawn.
+        The random disturbance of the power.
     plug_percent : float64 (n,)
         The true position of the plug.
     active : tuple of EffectSpec
-        What was switched on, with the values of all parameters.
+        The effects switched on, with the values of all parameters.
     """
 
     table: SampleTable
@@ -87,7 +87,7 @@ class SimulatedLog:
 
 
 class Recorder:
-    """Turns the rows of a plant into tables; knows how early the power is stamped."""
+    """Convert the rows of a plant into tables, with early stamps of the power if required."""
 
     def __init__(self, hooks: Hooks, start_ns: int, active: tuple[EffectSpec, ...]) -> None:
         self._hooks = hooks
@@ -100,7 +100,7 @@ class Recorder:
     def parts(
         self, plant: Plant, warm_up: int, rows: int, part_rows: int
     ) -> Iterator[SimulatedLog]:
-        """Run the plant and yield its record in parts of at most ``part_rows``."""
+        """Run the plant and yield its record in parts of at most ``part_rows`` rows."""
         window = plant.advance(warm_up + self.ahead)
         for first in range(0, rows, part_rows):
             kept = window.command.size - self.ahead - self.behind
@@ -110,7 +110,7 @@ class Recorder:
             yield self._part(window, first, count)
 
     def _part(self, window: PlantRows, first: int, count: int) -> SimulatedLog:
-        """Write rows ``[first, first + count)``, which begin at ``behind`` in the window."""
+        """Return the record of rows ``[first, first + count)``, at ``behind`` in the window."""
         unit = self._hooks.unit
         rows = window.part(self.behind, self.behind + count)
         power, noise = self._stamped(window.power, count), self._stamped(window.noise, count)
@@ -130,7 +130,7 @@ class Recorder:
         return SimulatedLog(table, rows.u, power, rows.load, unit, noise, rows.plug, self._active)
 
     def _stamped(self, column: FloatArray, count: int) -> FloatArray:
-        """Return the values that carry the stamps of the rows, linear between samples."""
+        """Return the values with the stamps of the rows, by linear interpolation."""
         whole = math.floor(self._shift)
         part = self._shift - whole
         first = self.behind + whole
@@ -159,27 +159,27 @@ def simulate(
     Parameters
     ----------
     days : float
-        Length, more than 0 and at most 400.
+        Duration, more than 0 and at most 400.
     seed : int
-        Every random number follows from it. The same numbers are used whatever
-        effects are on, and a longer run begins with the shorter one.
+        It determines every random number. The numbers do not depend on the effects,
+        and a longer run begins with the shorter one.
     unit : UnitDescription, optional
         Defaults to the unit of the paper's simulation study.
     start_ns : int
-        Time of the first row; it decides the time of day, taken as UTC.
+        Time of the first row, ns since 1970; it determines the time of day in UTC.
     effects : sequence of EffectSpec
-        What to switch on; their order makes no difference.
+        Effects to switch on; their order has no influence.
 
     Raises
     ------
     InputError
-        ``days``, ``seed`` or ``start_ns`` out of range, or effects that
-        cannot act in this run or not together.
+        ``days``, ``seed`` or ``start_ns`` is out of range, or effects cannot
+        act in this run or not together.
 
     Notes
     -----
-    A row takes about 90 bytes, twice that while the parts are joined: ten days
-    at 1 s 160 MB, a year 6 GB. For long runs use `simulate_parts`.
+    A row needs about 90 bytes, and twice this while the parts are joined: ten days
+    at 1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`.
     """
     return SimulatedLog.joined(list(simulate_parts(days, seed, unit, start_ns, effects)))
 
@@ -194,13 +194,13 @@ def simulate_parts(
 ) -> Iterator[SimulatedLog]:
     """Simulate as `simulate` does and yield the run in consecutive parts of ``part_s``.
 
-    The state goes on from part to part: joined, the parts are what `simulate`
-    returns, bit for bit, for any ``part_s``. Memory holds one part.
+    The state continues from part to part: the joined parts are equal to the result
+    of `simulate`, bit for bit, for any ``part_s``. One part is in memory at a time.
 
     Raises
     ------
     InputError
-        At the call, before anything runs; see `simulate`.
+        Raised at the call, before the simulation; see `simulate`.
     """
     unit = unit or UnitDescription()
     if not 0.0 < days <= LONGEST_DAYS:
@@ -222,7 +222,7 @@ def simulate_parts(
 
 
 def prepare(hooks: Hooks, seed: int, start_ns: int, effects: Sequence[EffectSpec]) -> Recorder:
-    """Check what every run is given, put the effects on the hooks, return the recorder.
+    """Check the arguments of a run, install the effects, and return the recorder.
 
     Raises
     ------

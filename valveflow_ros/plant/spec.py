@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An effect with the values of its parameters: what a person asks for."""
+"""An effect with the values of its parameters, as requested by a user."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from valveflow_ros.plant.effects import catalogue
 class EffectSpec:
     """An effect and the checked values of all its parameters.
 
-    Made by `parse` or `of`; ``str`` gives the text that `parse` reads back.
+    Created by `parse` or `of`; ``str`` returns a text that `parse` can read.
     """
 
     effect: Effect
@@ -26,12 +26,12 @@ class EffectSpec:
 
     @property
     def name(self) -> str:
-        """The catalogue's name."""
+        """Return the name in the catalogue."""
         return self.effect.name
 
     @property
     def parameters(self) -> dict[str, Value]:
-        """Every parameter with its value, those left at their default too."""
+        """Return all parameters with their values, including default values."""
         return dict(self.values.pairs)
 
     def __str__(self) -> str:
@@ -41,15 +41,15 @@ class EffectSpec:
 
     @classmethod
     def parse(cls, text: str, known: Mapping[str, Effect] | None = None) -> EffectSpec:
-        """Read ``NAME`` or ``NAME:key=value,...``; what is not given keeps its default.
+        """Read ``NAME`` or ``NAME:key=value,...``; other parameters keep their defaults.
 
         ``known`` are the effects by name, by default those of the catalogue.
 
         Raises
         ------
         InputError
-            Unknown effect or parameter, a value that is missing, no number or
-            out of range, or a parameter given twice; the sentence lists what is known.
+            Unknown effect or parameter, a value that is missing, no number or out
+            of range, or a parameter given twice; the message lists the known names.
         """
         name, colon, rest = text.strip().partition(':')
         effect = _lookup(name.strip(), known or catalogue())
@@ -72,7 +72,7 @@ class EffectSpec:
         Raises
         ------
         InputError
-            As `parse`.
+            As in `parse`.
         """
         if isinstance(effect, str):
             effect = _lookup(effect, catalogue())
@@ -91,15 +91,15 @@ class EffectSpec:
 
 
 def install(specs: Sequence[EffectSpec], hooks: Hooks) -> None:
-    """Put effects on the hooks of a run, in the order of their names.
+    """Install effects in the hooks of a run, in the order of their names.
 
-    The order in which they were given makes no difference, so that a set of
-    effects is one plant, bit for bit.
+    The order in which they were given has no influence, so that a set of
+    effects always gives the same plant, bit for bit.
 
     Raises
     ------
     InputError
-        One begins after the end of the run, or a place is claimed twice.
+        An effect begins after the end of the run, or two effects need the same place.
     """
     for spec in sorted(specs, key=str):
         start, days = spec.effect.starts_days(spec.values), hooks.length_s / DAY_S
@@ -112,7 +112,7 @@ def install(specs: Sequence[EffectSpec], hooks: Hooks) -> None:
 
 
 def describe(effect: Effect) -> str:
-    """Return a line for the effect and one for each parameter, for a person."""
+    """Return one line for the effect and one for each parameter, for the user."""
     lines = [f'{effect.name}: {effect.summary}']
     for row in effect.parameters:
         span = ', '.join(row.choices) if row.choices else f'{row.low:g} to {row.high:g}'

@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a unit of `valveflow_ros.plant.thermal_unit` or with its record.
+"""Possible faults of a unit of `valveflow_ros.plant.thermal_unit` or of its record.
 
-Effects that mean the same as on the paper's unit are taken from its catalogue. Those that
-change the paper's curve or its regions have no meaning here. Three more speak of places that the
-paper's unit does not have: the steam area, the position sensor's zero, the pressure sensor.
+Effects with the same meaning as in the paper's unit are taken from its catalogue. Effects that
+change the paper's curve or its regions have no meaning here. Three more effects act on parts that
+the paper's unit does not have: the steam area, the position sensor's zero, the pressure sensor.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class ThermalHooks(Hooks):
     Attributes
     ----------
     area : list of callables
-        Each returns a factor on the steam area, from seconds since the first row.
+        Each function returns a factor on the steam area at seconds since the first row.
     position_zero : list of callables
-        Each returns what the position sensor reads too high, %.
+        Each function returns the error of the position sensor in %, positive if too high.
     pressure_factor : float
-        What the pressure sensor reads, relative to the true pressure.
+        Measured pressure divided by true pressure.
     """
 
     area: list[Change] = field(default_factory=list)
@@ -57,7 +57,7 @@ class ThermalHooks(Hooks):
 
     @classmethod
     def for_run(cls, length_s: float) -> ThermalHooks:
-        """Return hooks with nothing on them; record effects ask them for the sample period."""
+        """Return hooks without effects; record effects read the sample period from them."""
         paper = UnitDescription()
         return cls(paper, length_s, paper.regions)
 
@@ -84,7 +84,7 @@ AREA_STEP = Effect(
 
 
 def _install_opening_offset(values: Values, hooks: Hooks) -> None:
-    """Let the position sensor read b + d t / 10 d too high; the servo follows the reading."""
+    """Add b + d t / 10 d to the measured position; the servo controls the measured value."""
 
     def change(time_s: FloatArray) -> FloatArray:
         return values['b_percent'] + values['drift_percent'] * ramp(time_s)
@@ -104,7 +104,7 @@ OPENING_OFFSET = Effect(
 
 
 def _install_pressure_scale(values: Values, hooks: Hooks) -> None:
-    """Let the pressure sensor read p (1 + g), for record and control alike."""
+    """Multiply the measured pressure by 1 + g, for the record and for the control."""
     hooks.claim('pressure_scale')
     _thermal(hooks).pressure_factor = 1.0 + values['g']
 
@@ -127,12 +127,12 @@ def thermal_catalogue() -> dict[str, Effect]:
 
 
 def thermal_effect(given: str | EffectSpec, kind: str) -> EffectSpec:
-    """Return an effect from its text, checked to have a meaning on a thermal unit.
+    """Return an effect from its text, after checking that it can act on a thermal unit.
 
     Raises
     ------
     InputError
-        As `EffectSpec.parse`, or an effect of the paper's curve or regions alone.
+        As in `EffectSpec.parse`, or an effect that only acts on the paper's curve or regions.
     """
     known = thermal_catalogue()
     name = given.partition(':')[0].strip() if isinstance(given, str) else given.name

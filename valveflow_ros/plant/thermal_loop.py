@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of governor, valve, turbine and boiler of a thermal unit, one second after the other.
+"""The loop of governor, valve, turbine and boiler of a thermal unit, in steps of one second.
 
-Lags are discretised exactly for an input that is held (controllers) or straight (steam) between
-two samples. The pressure of one second acts on the flow of the next, which is short against
-the boiler's storage.
+Lags are discretised exactly for an input that is constant (controllers) or linear (steam) between
+two samples. The pressure of one second acts on the flow of the next; this delay is short compared
+with the boiler's storage.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from valveflow_ros.plant.thermal_unit import TABLE_STEP_PERCENT, ThermalUnit
 from valveflow_ros.records import FloatArray
 
 _LOWEST_OPENING, _SERVO_PERCENT_PER_S = 3.0, 10.0
-# The condenser: cooling water warms by so much at full flow, steam condenses so much above it.
+# The condenser: temperature rise of the cooling water at full flow, and terminal difference.
 _WATER_RISE_K, _TERMINAL_K, _CONDENSER_S = 9.5, 4.0, 60.0
 
 
 class Series(NamedTuple):
-    """What drives the loop; float64 (n,) each.
+    """The inputs of the loop; float64 (n,) each.
 
-    MW, MW, MPa, share of full firing, factor on the power, MW, factor on and error of the
+    MW, MW, MPa, fraction of full firing, factor on the power, MW, factor on and error of the
     position, factor on the area, degC, MW, MW, MPa.
     """
 
@@ -48,11 +48,11 @@ class Series(NamedTuple):
 
 
 class TrueRows(NamedTuple):
-    """What really happened, every second; float64 (n,) each.
+    """The true values, every second; float64 (n,) each.
 
-    %, % (of the servo, before anything behind the position sensor), %, MPa, MPa in the drum,
-    share of full flow, heat that the boiler took up in the last second as a share of that of
-    full flow, MW without the meter's noise, kPa.
+    %, % (of the servo, before the effects after the position sensor), %, MPa, MPa in the drum,
+    fraction of full flow, heat that the boiler absorbed in the last second as a fraction of that
+    of full flow, MW without the meter's noise, kPa.
     """
 
     command: FloatArray
@@ -71,10 +71,10 @@ class TrueRows(NamedTuple):
 
 
 class Law(NamedTuple):
-    """What stays the same during a run; lags are (a, b, c) of `lag_coefficients`.
+    """The constants of a run; lags are (a, b, c) of `lag_coefficients`.
 
-    ``bank_*`` are (largest step, slip-off, slip-to, top, half slack), of what stands before and
-    behind the position sensor.
+    ``bank_*`` are (largest step, slip-off, slip-to, top, half slack) of the parts before and
+    after the position sensor.
     """
 
     area: FloatArray
@@ -102,10 +102,10 @@ class Law(NamedTuple):
 
 
 def law_of(unit: ThermalUnit, hooks: ThermalHooks) -> Law:
-    """Collect what stays the same during a run."""
+    """Return the constants of a run."""
     area = unit.area_table()
     known = np.arange(area.size) * TABLE_STEP_PERCENT
-    # A governor knows its valve by a table of few points only.
+    # The table of a governor has few points.
     points = np.linspace(0.0, 104.0, 14)
     at_points = np.interp(points, known, area)
     rising = np.append(True, np.diff(at_points) > 1e-6)
@@ -130,7 +130,7 @@ def law_of(unit: ThermalUnit, hooks: ThermalHooks) -> Law:
 
 @jit
 def _at(table: FloatArray, step: float, x: float) -> float:
-    """Interpolate a table over multiples of ``step``; level beyond its ends."""
+    """Interpolate a table over multiples of ``step``; constant beyond its ends."""
     place = min(max(x / step, 0.0), table.size - 1.000001)
     k = int(place)
     return float(table[k] + (table[k + 1] - table[k]) * (place - k))
@@ -144,10 +144,10 @@ def _saturation_kpa(degc: float) -> float:
 
 @jit
 def _through(wanted: float, memory: FloatArray, bank: tuple[float, ...]) -> float:
-    """Move through servo speed, friction, stop and slack; ``memory`` is (6,).
+    """Return the position after servo speed, friction, stop and slack; ``memory`` is (6,).
 
-    Friction has two states: the stem is at rest until the pull exceeds (S + J) / 2, slips by J,
-    then follows (S - J) / 2 behind until the pull stops or turns.
+    Friction has two states: the stem is at rest until the force exceeds (S + J) / 2 and slips by
+    J. Then it follows with a lag of (S - J) / 2 until the force stops or reverses.
     """
     servo, before, position, direction = memory[0], memory[1], memory[2], memory[3]
     servo += min(max(wanted - servo, -bank[0]), bank[0])
@@ -168,7 +168,7 @@ def _through(wanted: float, memory: FloatArray, bank: tuple[float, ...]) -> floa
 
 @jit
 def _governor_opening(flow: float, density: float, law: Law) -> float:
-    """Return the opening that the governor's table gives for a flow."""
+    """Return the opening of the governor's table for a flow."""
     if law.on_opening:
         opening = _at(law.opening_of, law.inverse_step, flow / density)
     else:
@@ -178,7 +178,7 @@ def _governor_opening(flow: float, density: float, law: Law) -> float:
 
 @jit
 def _flow(plug: float, pressure: float, law: Law) -> float:
-    """Return the steam flow as a share of the full one."""
+    """Return the steam flow as a fraction of the full flow."""
     density = (pressure / law.rated_pressure) ** law.exponent
     if law.on_opening:
         return float(density * _at(law.area, TABLE_STEP_PERCENT, plug))
@@ -187,7 +187,7 @@ def _flow(plug: float, pressure: float, law: Law) -> float:
 
 @kernel
 def run(series: Series, law: Law, out: FloatArray) -> None:
-    """Fill ``out`` (9, n) as `TrueRows`, beginning at rest."""
+    """Fill ``out`` (9, n) as `TrueRows`, starting in steady state."""
     rated, full = law.rated_pressure, law.full_mw
     demand = series.demand[0]
     flow = heat = mill = firing = direct = reheated = warmed = (demand + law.no_load_mw) / full
@@ -206,7 +206,7 @@ def run(series: Series, law: Law, out: FloatArray) -> None:
     loss_decay, seen_decay = np.exp(-1.0 / 4.0), np.exp(-1.0 / 3.0)
     warm_decay = np.exp(-1.0 / _CONDENSER_S)
     for t in range(series.demand.size):
-        # Boiler: mills, furnace, storage, and the loss of pressure on the way to the valve.
+        # Boiler: mills, furnace, storage, and the pressure drop up to the valve.
         mill_old, heat_old = mill, heat
         mill = law.mill * mill + (1.0 - law.mill) * firing
         heat = fa * heat + fb * mill_old + fc * mill
@@ -214,7 +214,7 @@ def run(series: Series, law: Law, out: FloatArray) -> None:
         drum += rated / law.storage_s * (taken - flow)
         lost = loss_decay * lost + (1.0 - loss_decay) * law.drop * rated * flow * flow
         pressure = max(drum - lost, 0.05 * rated)
-        # Valve. The servo's loop is closed on what the position sensor reads.
+        # Valve. The servo controls the measured position.
         servo = law.servo * servo + (1.0 - law.servo) * command
         stem = _through(servo, before, law.bank_before)
         position = (stem - series.position_zero[t]) * series.position_factor[t]
@@ -231,8 +231,8 @@ def run(series: Series, law: Law, out: FloatArray) -> None:
         worse = condenser - _saturation_kpa(law.water_reference + above)
         gain = series.gain[t] * (1.0 + law.vacuum_per_kpa * worse)
         power = (full * steam - law.no_load_mw) * gain + series.offset[t] + series.swing[t]
-        # Governor: what is asked for, fed forward, and an integral of what is missing beside
-        # an answer of the usual shape.
+        # Governor: feedforward of the set point, and an integral of the deviation from a
+        # response of the usual shape.
         demand_old, demand = demand, series.demand[t] + series.primary[t]
         reference = ra * reference + rb * demand_old + rc * demand
         expected = law.share * demand + (1.0 - law.share) * reference
@@ -247,7 +247,7 @@ def run(series: Series, law: Law, out: FloatArray) -> None:
         wanted = (demand + trim + 0.1 * missing + law.no_load_mw) / full
         density = (max(seen, 0.05 * rated) / rated) ** law.exponent
         command = _governor_opening(max(wanted, 0.0), density, law)
-        # Fire: the load fed forward with what a moving set point stores, and pressure control.
+        # Fire: feedforward of load and of the storage for a new set point, and pressure control.
         short = (series.pressure_set[t] - seen) / rated
         rise = (series.pressure_set[t] - series.pressure_set[max(t - 1, 0)]) / rated
         asked = (series.demand[t] + law.no_load_mw) / full + law.storage_s * rise

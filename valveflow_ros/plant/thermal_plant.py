@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a unit of `valveflow_ros.plant.thermal_unit` and record it as a historian does.
+"""Simulate a unit of `valveflow_ros.plant.thermal_unit` and the record of its historian.
 
-Schedule and AGC give a set point, primary response adds to it, a governor turns it into an
-opening, steam flows, turbine and boiler answer, instruments and a historian write it down.
+The set point comes from schedule, AGC and primary response. The governor converts it into an
+opening, turbine and boiler respond, and instruments and a historian record the values.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from valveflow_ros.records import (
 
 LONGEST_DAYS = 60.0
 _WARM_UP_S = 7200
-# Rows behind the end, for a clock that stamps the power early; always simulated, so that
-# switching it on changes no random number.
+# Rows after the end, for a clock that stamps the power early. They are always simulated, so
+# that this effect does not change the random numbers.
 _MARGIN_S = 600
-# Share of the range of load by hour of day: a morning and an evening peak.
+# Fraction of the range of load by hour of day: a morning and an evening peak.
 _HOURS = (0.0, 4.0, 7.0, 10.0, 13.0, 17.0, 20.0, 23.0, 24.0)
 _SHARES = (0.35, 0.15, 0.45, 0.9, 0.6, 0.75, 1.0, 0.55, 0.35)
 _PRIMARY_LIMIT = 0.06
@@ -51,25 +51,25 @@ _NOMINAL_HZ = 50.0
 
 @dataclass(frozen=True, slots=True)
 class ThermalLog:
-    """What the historian kept of a thermal unit, and the truth behind it.
+    """The record of a thermal unit, and the true values.
 
     Attributes
     ----------
     table : SampleTable
-        The five signals. Where values have times of their own, NaN means no new value.
+        The five signals. If values have their own times, NaN means no new value.
     extra : dict of float64 (n,)
-        Further columns on the same rows: ``condenser_pressure_kpa``, ``grid_frequency_hz``,
+        Further columns of the same rows: ``condenser_pressure_kpa``, ``grid_frequency_hz``,
         and ``valve_1_position_percent`` and so on of valves in sequence.
     unit : ThermalUnit
-        Without its effects.
+        The unit without its effects.
     historian : Historian
         How it was recorded.
     truth : TrueRows
-        Every second from the first sample on, whatever was recorded.
+        True values of every second from the first sample on, for any recording.
     demand_mw, temperature_degc, water_degc : float64 (n,)
-        Set point after the rate limit, true steam and cooling water temperature; as ``truth``.
+        Set point after the rate limit, true steam and cooling water temperature, every second.
     active : tuple of EffectSpec
-        What was switched on.
+        The effects switched on.
     """
 
     table: SampleTable
@@ -88,7 +88,7 @@ class ThermalLog:
 
     @property
     def readings(self) -> Readings:
-        """The values one by one, without the empty cells of values with their own times."""
+        """Return the values one by one, without the empty cells of values with their own times."""
         readings = table_to_readings(self.table)
         if not self.historian.own_times:
             return readings
@@ -99,12 +99,12 @@ class ThermalLog:
         )  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
-        """Return what is true of the plant.
+        """Return the true values of the plant.
 
         ``form``, ``pressure_exponent``, ``pressure_scale_exponent`` and ``offset_mw`` describe
-        the static power as a characteristic does. ``curve`` is the static power at rated
+        the static power as in a characteristic. ``curve`` is the static power at rated
         pressure; its ``knees`` are in % for the form 'opening', in % MPa^m for
-        'integrated_input', and for 'sequence' where a valve begins to open.
+        'integrated_input'; for 'sequence' a valve begins to open there.
         """
         unit = self.unit
         opening = np.arange(0.0, 100.1, 2.5)
@@ -120,7 +120,7 @@ class ThermalLog:
             'form': unit.form,
             'pressure_exponent': unit.exponent,
             'pressure_scale_exponent': unit.exponent if at_opening else 0.0,
-            # The paper's F holds the no-load power itself.
+            # The paper's F contains the no-load power.
             'offset_mw': -unit.no_load_mw if at_opening else 0.0,
             'no_load_mw': unit.no_load_mw,
             'curve': {
@@ -156,26 +156,26 @@ def simulate_thermal(
     Parameters
     ----------
     days : float
-        Length, more than 0 and at most 60.
+        Duration, more than 0 and at most 60.
     seed : int
-        Every random number follows from it, whatever effects are on and however it is recorded.
+        It determines every random number, for all effects and recordings.
     unit : ThermalUnit, optional
-        By default one of the kind 'choked'.
+        By default a unit of the kind 'choked'.
     historian : Historian, optional
-        By default every sample is kept.
+        By default every sample is stored.
     start_ns : int
-        Time of the first sample; it decides the time of day, taken as UTC.
+        Time of the first sample, ns since 1970; it determines the time of day in UTC.
     effects : sequence of str or EffectSpec
-        What to switch on, of `thermal_catalogue`; their order makes no difference.
+        Effects of `thermal_catalogue` to switch on; their order has no influence.
 
     Raises
     ------
     InputError
-        An argument is out of range, or effects that cannot act in this run or not together.
+        An argument is out of range, or effects cannot act in this run or not together.
 
     Notes
     -----
-    A day takes about 50 MB.
+    A day needs about 50 MB.
     """
     unit, historian = unit or ThermalUnit(), historian or Historian()
     if not 0.0 < days <= LONGEST_DAYS:
@@ -211,7 +211,7 @@ def simulate_thermal(
     )  # fmt: skip
 
 
-# What acts on the unit from outside.
+# Inputs of the unit from outside.
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ class _Outside:
         rows: int,
         clock_s: float,
     ) -> _Outside:
-        """Draw everything, from the start of the warm-up to the margin behind the end."""
+        """Draw all inputs, from the start of the warm-up to the margin after the end."""
         n = _WARM_UP_S + rows + _MARGIN_S
         time_s = np.arange(n, dtype=np.float64) - _WARM_UP_S
         clock = np.mod(clock_s + time_s, DAY_S)
@@ -292,7 +292,7 @@ def _set_point(
         agc_on += [agc_on[-1], float(rng.random() < 0.7)]
         level = target
     schedule = np.interp(time_s, knots_s, knots_mw)
-    # AGC asks for another amount every 20 to 120 s; some holds are without it.
+    # AGC changes its demand every 20 to 120 s; some holds of the load have no AGC.
     count = int(np.ptp(time_s) / 20.0) + 2
     moments = time_s[0] + np.cumsum(rng.uniform(20.0, 120.0, count))
     amounts = unit.agc_mw * Wander(rng, 6.0, 1.0).advance(count)
@@ -303,7 +303,7 @@ def _set_point(
 
 
 def _reserve(unit: ThermalUnit, rng: np.random.Generator, n: int) -> FloatArray:
-    """Return how far the pressure stands above the sliding one, 0 to 1 on the way to the rated."""
+    """Return the pressure reserve, from 0 at the sliding pressure to 1 at the rated pressure."""
     wanted = np.zeros(n)
     begin = 0
     while begin < n:
@@ -311,12 +311,12 @@ def _reserve(unit: ThermalUnit, rng: np.random.Generator, n: int) -> FloatArray:
         asked, way = rng.random(), rng.uniform(0.3, 1.0)
         wanted[begin:end] = way if asked < unit.reserve_hours else 0.0
         begin = end
-    # An operator takes three quarters of an hour for all of the way.
+    # An operator needs three quarters of an hour for the full change.
     return np.asarray(_rate_limited(wanted, 1.0 / 2700.0))
 
 
 def _frequency(rng: np.random.Generator, n: int) -> FloatArray:
-    """Return the grid's frequency in Hz: unrest, and now and then a lost generator or load."""
+    """Return the grid's frequency in Hz: noise, and sometimes the loss of a generator or load."""
     deviation = 0.012 * Wander(rng, 300.0, 1.0).advance(n)
     deviation += 0.006 * Wander(rng, 15.0, 1.0).advance(n)
     now = rng.exponential(DAY_S / 4.0)
@@ -331,7 +331,7 @@ def _frequency(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def _temperature(unit: ThermalUnit, rng: np.random.Generator, demand: FloatArray) -> FloatArray:
-    """Return the steam temperature in degC: colder at low load and after a rise of load."""
+    """Return the steam temperature in degC: lower at low load and after an increase of load."""
     short = (unit.load_high_mw - demand) / (unit.load_high_mw - unit.load_low_mw)
     per_min = 60.0 * np.diff(demand, prepend=demand[0])
     return np.asarray(
@@ -344,7 +344,7 @@ def _temperature(unit: ThermalUnit, rng: np.random.Generator, demand: FloatArray
 
 @kernel
 def _rate_limited(target: FloatArray, per_row: float) -> FloatArray:
-    """Follow a target by at most ``per_row`` a row."""
+    """Follow a target by at most ``per_row`` per row."""
     out = np.empty_like(target)
     now = target[0]
     for t in range(target.size):
@@ -354,7 +354,7 @@ def _rate_limited(target: FloatArray, per_row: float) -> FloatArray:
 
 
 def _lagged(signal: FloatArray, time_s: float) -> FloatArray:
-    """Return a first-order lag, at rest at the first value."""
+    """Return the output of a first-order lag, in steady state at the first value."""
     return np.asarray(_lag_rows(signal, *lag_coefficients(time_s, 1.0)))
 
 
@@ -378,7 +378,7 @@ def _instruments(
     rng: np.random.Generator,
     rows: int,
 ) -> dict[str, FloatArray]:
-    """Return what the instruments show every second, by column, float64 (rows,)."""
+    """Return the measured values of every second, by column, float64 (rows,)."""
     kept = slice(_WARM_UP_S, _WARM_UP_S + rows)
     n, noise = truth.power.size, unit.noise
     series = outside.series
@@ -411,6 +411,6 @@ def _instruments(
 
 
 def _shifted(column: FloatArray, lead_s: float) -> FloatArray:
-    """Return the values that stand ``lead_s`` later, linear between samples."""
+    """Return the values at times ``lead_s`` later, by linear interpolation."""
     place: IntArray = np.arange(column.size)
     return np.interp(place + lead_s, place, column) if lead_s else column

@@ -1,10 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is fixed about a unit that is built from physics: its valves, steam, boiler and turbine.
+"""The constants of a unit with a physical model: valves, steam, boiler and turbine.
 
-Nothing here comes from the paper. Steam flow is a power of the pressure times an area that
-the opening sets, and power is a share of the flow less the load that the flow must carry
-before any power is made (Willans line).
+Nothing here comes from the paper. The steam flow is a power of the pressure times an area
+that depends on the opening. The power is proportional to the flow minus the flow at no load
+(Willans line).
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy as np
 from valveflow_ros.errors import InputError
 from valveflow_ros.records import FloatArray
 
-# Openings beyond 100 % do not occur; the table ends where the area of a group does.
+# Openings above 100 % do not occur; the table ends at the end of the area of a group.
 _TABLE_PERCENT = 130.0
 TABLE_STEP_PERCENT = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothArea:
-    """The area of valves that move together: nearly straight sections with rounded knees.
+    """The area of valves that move together: nearly straight sections with rounded joints.
 
     Attributes
     ----------
     knees_percent : tuple of float
-        Where the sections meet, %.
+        Openings at which the sections meet, %.
     slopes : tuple of float
-        Of the sections, one more than there are knees; only their ratios matter.
+        Slopes of the sections, one more than knees; only their ratios matter.
     rounding_percent : float
-        Opening over which four fifths of a knee's change of slope happen, %.
+        Width of opening of four fifths of a knee's change of slope, %.
     """
 
     knees_percent: tuple[float, ...] = (50.0, 71.0)
@@ -42,7 +42,7 @@ class SmoothArea:
     rounding_percent: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no rising curve."""
+        """Check that the curve rises."""
         knees = self.knees_percent
         good = len(self.slopes) == len(knees) + 1 and min(self.slopes) > 0.0
         if not (good and list(knees) == sorted(knees) and 0.1 <= self.rounding_percent <= 10.0):
@@ -52,7 +52,7 @@ class SmoothArea:
             )
 
     def __call__(self, opening_percent: FloatArray) -> FloatArray:
-        """Return the area in units of its own, 0 at 0 %."""
+        """Return the area in arbitrary units, 0 at 0 %."""
         # Each knee adds the integral of a logistic step of slope, 10 to 90 % of it in 4.4 widths.
         width = self.rounding_percent / (2.0 * np.log(9.0))
         area = self.slopes[0] * opening_percent
@@ -71,11 +71,11 @@ class GovernorValve:
     Attributes
     ----------
     from_percent, to_percent : float
-        Demand at which it leaves its seat and at which it is fully open, %.
+        Demands at which it begins to open and at which it is fully open, %.
     share : float
-        Of the whole area; only ratios matter.
+        Fraction of the whole area; only ratios matter.
     bend : float
-        How far its area flattens towards full lift; 0 is straight.
+        Flattening of its area towards full lift; 0 is straight.
     """
 
     from_percent: float
@@ -91,7 +91,7 @@ class GovernorValve:
     def area(self, demand_percent: FloatArray) -> FloatArray:
         """Return its area at a demand, 0 to ``share``."""
         lift = self.lift_percent(demand_percent) / 100.0
-        # The pilot opens first: the area begins without a slope and is straight after a tenth.
+        # The pilot opens first: the area begins with slope 0 and is straight after a tenth.
         raised = lift * lift / (lift + 0.1) * 1.1
         if self.bend == 0.0:
             return np.asarray(self.share * raised)
@@ -101,7 +101,7 @@ class GovernorValve:
 
 @dataclass(frozen=True, slots=True)
 class SequencedValves:
-    """Three or four governor valves that open one after the other, with overlap."""
+    """Three or four governor valves that open in sequence, with overlap."""
 
     valves: tuple[GovernorValve, ...] = (
         GovernorValve(0.0, 46.0, 0.31),
@@ -111,7 +111,7 @@ class SequencedValves:
     )
 
     def __post_init__(self) -> None:
-        """Refuse valves that cannot work together."""
+        """Check that the valves suit each other."""
         good = 1 <= len(self.valves) <= 8 and all(
             v.from_percent < v.to_percent and v.share > 0.0 and v.bend >= 0.0 for v in self.valves
         )
@@ -119,7 +119,7 @@ class SequencedValves:
             raise InputError('A sequence needs 1 to 8 valves with a range and a share above 0.')
 
     def __call__(self, opening_percent: FloatArray) -> FloatArray:
-        """Return the area in units of its own, 0 at 0 %."""
+        """Return the area in arbitrary units, 0 at 0 %."""
         return np.asarray(sum(valve.area(opening_percent) for valve in self.valves))
 
 
@@ -141,7 +141,7 @@ RESOLUTION: dict[str, float] = {
     'grid_frequency_hz': 0.001,
 }
 
-# The kinds: what the flow follows, and whether the pressure slides with load.
+# The kinds: the law of the flow, and sliding or fixed pressure.
 
 KINDS = {
     'choked': ('opening', True),
@@ -161,7 +161,7 @@ class ThermalUnit:
     ----------
     kind : str
         One of `KINDS`: 'choked' has the flow ``p^m f(V)``, 'sequence' the same with several
-        valves, 'integrated_input' the paper's ``g(V p^m)``; '_fixed' keeps the pressure.
+        valves, 'integrated_input' the paper's ``g(V p^m)``; '_fixed' means fixed pressure.
     area : SmoothArea or SequencedValves
         f, or g over the opening at rated pressure.
     exponent : float
@@ -169,38 +169,38 @@ class ThermalUnit:
     rated_mw, no_load_mw : float
         Power at full flow, and c: power = (rated + c) flow - c.
     full_opening_percent : float
-        Opening that passes the full flow at rated pressure.
+        Opening of full flow at rated pressure.
     load_low_mw, load_high_mw : float
         Range of the load schedule.
     pressure_rated_mpa, pressure_low_mpa : float
         Set point at and above ``slide_to_mw``, and at and below ``slide_from_mw``.
     pressure_wander_mpa : float
-        Standard deviation of the set point's slow wander, on top of what the fire does.
+        Standard deviation of the set point's slow variation, in addition to that by the fire.
     reserve_hours : float
-        Share of the time at which a sliding unit is asked for a reserve: some of the way from the
-        sliding pressure up to the rated one, for hours, so that the valve throttles.
+        Fraction of the time at which a sliding unit must have a reserve: for hours the pressure is
+        between the sliding and the rated one, so that the valve throttles.
     storage_s, fuel_s, mill_s : float
-        Seconds of full flow that empty the boiler of its pressure; lags of the fire.
+        Seconds of full flow that would consume the boiler's pressure; lags of the fire.
     drop : float
-        Pressure lost between drum and valve at full flow, of the rated pressure.
+        Pressure drop between drum and valve at full flow, as a fraction of the rated pressure.
     actuator_s, high_pressure_s, reheater_s, high_pressure_share
-        Lags, and the share of the power made before the reheater.
+        Lags in s, and the fraction of the power generated before the reheater.
     integral_s : float
         Reset time of the governor's integral action on MW.
     ramp_mw_per_min, agc_mw : float
-        Fastest change of the set point; standard deviation of what AGC adds to the schedule.
+        Maximum rate of the set point; standard deviation of the AGC's addition to the schedule.
     droop, dead_band_hz : float
         Primary response.
     temperature_degc, temperature_wander_k, temperature_load_k : float
-        Steam temperature at full load, its wander, and how much colder it is at lowest load.
+        Steam temperature at full load, its random variation, and its decrease at lowest load.
     temperature_per_k, vacuum_per_kpa : float
         Relative change of the power per K and per kPa of condenser pressure; 0 is none.
     water_degc, water_weather_k, water_daily_k : float
-        Cooling water: mean (the reference), weather over days, amplitude of the day.
+        Cooling water: mean (the reference), variation by weather over days, daily amplitude.
     swing_mw : float
-        Standard deviation of the power's own unrest, with a time of 15 s.
+        Standard deviation of the power's own noise, with a time constant of 15 s.
     fire : float
-        Standard deviation of the heat's unrest, with a time of 900 s, of that of full flow.
+        Standard deviation of the heat's noise as a fraction of full flow; time constant 900 s.
     noise, resolution : dict
         Standard deviation and smallest step of the instruments, by column.
     """
@@ -246,7 +246,7 @@ class ThermalUnit:
     resolution: dict[str, float] = field(default_factory=lambda: dict(RESOLUTION))
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated."""
+        """Check that the unit can be simulated."""
         if self.kind not in KINDS:
             raise InputError(f"There is no unit '{self.kind}': use one of {', '.join(KINDS)}.")
         times = (self.storage_s, self.fuel_s, self.mill_s, self.actuator_s, self.high_pressure_s,
@@ -285,12 +285,12 @@ class ThermalUnit:
 
     @property
     def form(self) -> str:
-        """What the knees are fixed in: 'opening', 'sequence' or 'integrated_input'."""
+        """Return the variable of the breakpoints: 'opening', 'sequence' or 'integrated_input'."""
         return KINDS[self.kind][0]
 
     @property
     def on_opening(self) -> bool:
-        """Return whether the area is a function of the opening alone."""
+        """Return True if the area is a function of the opening only."""
         return self.form != 'integrated_input'
 
     def area_table(self) -> FloatArray:
@@ -299,7 +299,7 @@ class ThermalUnit:
         return self.area(opening) / float(self.area(np.array(self.full_opening_percent)))
 
     def flow(self, opening_percent: FloatArray, pressure_mpa: FloatArray) -> FloatArray:
-        """Return the steam flow at rest, as a share of the full flow."""
+        """Return the steady-state steam flow, as a fraction of the full flow."""
         density = (np.asarray(pressure_mpa) / self.pressure_rated_mpa) ** self.exponent
         table = self.area_table()
         known = np.arange(table.size) * TABLE_STEP_PERCENT
@@ -308,7 +308,7 @@ class ThermalUnit:
         return np.asarray(np.interp(np.asarray(opening_percent) * density, known, table))
 
     def static_power(self, opening_percent: FloatArray, pressure_mpa: FloatArray) -> FloatArray:
-        """Return the power at rest, without effects.
+        """Return the steady-state power, without effects.
 
         Parameters
         ----------
@@ -327,7 +327,7 @@ class ThermalUnit:
         return np.asarray((self.rated_mw + self.no_load_mw) * flow - self.no_load_mw)
 
     def pressure_set_mpa(self, load_mw: FloatArray) -> FloatArray:
-        """Return the pressure that belongs to a load: level, sliding, level."""
+        """Return the pressure set point at a load: constant, sliding, constant."""
         return np.asarray(
             np.interp(
                 load_mw,
@@ -337,7 +337,7 @@ class ThermalUnit:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return all that is fixed about the unit."""
+        """Return all constants of the unit."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, dict):
@@ -350,8 +350,8 @@ class ThermalUnit:
 def random_unit(kind: str, number: int) -> ThermalUnit:
     """Draw a unit of a kind; the same number gives the same unit.
 
-    The knees lie where the load schedule takes the valve, the pressure of a sliding unit lies
-    between 7 and 18 MPa, and full load leaves the valve a reserve.
+    The breakpoints are in the valve's range of operation, the pressure of a sliding unit is
+    between 7 and 18 MPa, and the valve has a reserve at full load.
 
     Raises
     ------
@@ -374,7 +374,7 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
     )
     lowest = top
     if sliding:
-        # At the lower end of the slide this share of the full area is open.
+        # Fraction of the full area that is open at the lower end of the sliding range.
         open_share = rng.uniform(0.74, 0.9) if form == 'sequence' else rng.uniform(0.8, 0.94)
         flow = (slide_from + c) / (rated + c)
         lowest = max(7.0, top * (flow / open_share) ** (1.0 / exponent))
@@ -386,7 +386,7 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
         slide_from_mw=slide_from, slide_to_mw=slide_to,
         pressure_wander_mpa=rng.uniform(0.18, 0.32) if sliding else rng.uniform(0.06, 0.15),
         reserve_hours=rng.uniform(0.2, 0.6),
-        # Half of the units have a drum; once-through boilers store less and answer faster.
+        # Half of the units have a drum; once-through boilers store less and respond faster.
         storage_s=rng.uniform(180.0, 300.0) if rng.random() < 0.5 else rng.uniform(110.0, 150.0),
         fuel_s=rng.uniform(60.0, 110.0), mill_s=rng.uniform(15.0, 35.0),
         drop=rng.uniform(0.03, 0.07), actuator_s=rng.uniform(0.6, 1.4),
@@ -403,7 +403,7 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
 
 def _smooth(rng: np.random.Generator, sliding: bool) -> SmoothArea:
     """Draw three sections whose slopes fall by a factor of 1.6 to 2.6 from one to the next."""
-    # A fixed pressure takes the valve over a wider range, from much smaller openings.
+    # With fixed pressure the valve has a wider range, from much smaller openings.
     first = rng.uniform(44.0, 54.0) if sliding else rng.uniform(34.0, 48.0)
     second = first + rng.uniform(17.0, 23.0)
     slopes = 1.0 / np.append(1.0, np.cumprod(rng.uniform(1.6, 2.6, 2)))
@@ -420,7 +420,7 @@ def _sequence(rng: np.random.Generator) -> SequencedValves:
     bends = rng.uniform(1.6, 2.8, 3)
     rows = list(zip(starts, ends, shares, bends, strict=True))
     if count == 4:
-        # Two valves open together first, not quite alike.
+        # Two slightly different valves open together first.
         start, end, share, bend = rows[0]
         later = end + rng.uniform(2.0, 6.0)
         rows[:1] = [(start, end, share / 2.0, bend), (start, later, share / 2.0, bend)]
@@ -433,8 +433,8 @@ _OPTIONS = ('number', 'vacuum_per_kpa', 'temperature_per_k')
 def unit_of(text: str) -> ThermalUnit:
     """Read ``KIND`` or ``KIND:key=value,...``.
 
-    Keys are ``number`` (which unit of the kind, as `random_unit` draws it; left out: number
-    0), ``vacuum_per_kpa`` and ``temperature_per_k``.
+    Keys are ``number`` (the number of the unit for `random_unit`, default 0),
+    ``vacuum_per_kpa`` and ``temperature_per_k``.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is fixed about a simulated unit: its curve, its dynamics, its noise and its habits.
+"""The constants of a simulated unit: its curve, dynamics, noise and load programme.
 
-The defaults are the simulation study of the paper, eqs. (30) (as printed for
-the simulation) and (31), with the load programme of a 300 MW unit.
+The defaults are those of the simulation study of the paper, eqs. (30) (as printed
+for the simulation) and (31), with the load programme of a 300 MW unit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from valveflow_ros.records import FloatArray
 
 
 def _refuse_unless(what: str, *checks: tuple[bool | np.bool_, str]) -> None:
-    """Raise with the sentence of the first check that failed."""
+    """Raise an error with the message of the first check that failed."""
     for good, sentence in checks:
         if not good:
             raise InputError(f'This {what} cannot be simulated: {sentence}.')
@@ -41,7 +41,7 @@ class Curve:
     intercepts: FloatArray
 
     def __post_init__(self) -> None:
-        """Refuse what is no rising curve."""
+        """Check that the curve rises."""
         if len(self.knots) != len(self.slopes) + 1 or len(self.slopes) != len(self.intercepts):
             raise InputError(
                 'A curve of J pieces needs J + 1 ends of pieces, J slopes and J intercepts.'
@@ -50,7 +50,7 @@ class Curve:
             raise InputError('The knots of a simulated curve must increase and its slopes be > 0.')
 
     def __call__(self, u: FloatArray) -> FloatArray:
-        """Evaluate F; the outer pieces go on beyond the outer knots."""
+        """Evaluate F; the outer pieces extend beyond the outer knots."""
         piece = np.searchsorted(self.knots[1:-1], u, side='right')
         return np.asarray(self.slopes[piece] * u + self.intercepts[piece])
 
@@ -76,7 +76,7 @@ class Region:
     delay_s: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no first-order lag with delay."""
+        """Check that the values form a first-order lag with delay."""
         if not (0.0 < self.time_constant_s < np.inf and 0.0 <= self.delay_s < np.inf):
             raise InputError(
                 f'A region needs a time constant above 0 s and a delay of 0 s or more, '
@@ -90,8 +90,8 @@ class Noise:
 
     ``wander_mw`` is a second, slower disturbance (0: absent). With
     ``load_dependence`` k the disturbance of the power is multiplied by
-    1 + k (load - mean) / (high - mean), so that 0.5 means half as much again
-    at full load. Neither is a cause of anything: both are noise.
+    1 + k (load - mean) / (high - mean), so that 0.5 means 1.5 times the noise
+    at full load. Both are noise and no fault.
     """
 
     slow_mw: float = 2.0
@@ -105,7 +105,7 @@ class Noise:
     load_dependence: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse sizes below zero and times of zero."""
+        """Check that sizes are not negative and times are positive."""
         times = (self.slow_time_s, self.wander_time_s)
         sizes = (
             self.slow_mw,
@@ -125,7 +125,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """How the unit is driven: load targets, ramps, sliding pressure, frequency pulses."""
+    """The operation of the unit: load targets, ramps, sliding pressure, frequency pulses."""
 
     load_mean_mw: float = 228.0
     load_daily_mw: float = 32.0
@@ -160,7 +160,7 @@ class Programme:
     feedback_off_above_mw: float = 289.0
 
     def __post_init__(self) -> None:
-        """Refuse habits that contradict each other."""
+        """Check that the values do not contradict each other."""
         low, high = self.load_low_mw, self.load_high_mw
         times = (
             self.pressure_lag_s,
@@ -202,7 +202,7 @@ class Programme:
         )
 
     def sliding_pressure_mpa(self, load_mw: FloatArray) -> FloatArray:
-        """Return the pressure set point that belongs to a load, in MPa."""
+        """Return the pressure set point at a load, in MPa."""
         share = (load_mw - self.load_low_mw) / self.pressure_span_mw
         return np.asarray(self.pressure_low_mpa + self.pressure_rise_mpa * share)
 
@@ -233,7 +233,7 @@ class UnitDescription:
     sample_period_s: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated."""
+        """Check that the unit can be simulated."""
         if not 0.01 <= self.sample_period_s <= 60.0:
             raise InputError(
                 f'The sample period must lie between 0.01 and 60 s, not {self.sample_period_s}.'
@@ -246,10 +246,10 @@ class UnitDescription:
             )
 
 
-# Other plausible units, so that nothing is fitted to the one unit of the paper.
+# Other plausible units, so that the program is not tuned to the unit of the paper.
 
 _EXPONENT = 1.125
-# The paper's unit, from which habits in MW and u are scaled.
+# The paper's unit, from which programmes in MW and u are scaled.
 _PAPER_RATED_MW = 300.0
 _PAPER_LOAD_SPAN_MW = 133.5
 _PAPER_U_SPAN = 1200.0
@@ -258,9 +258,9 @@ _PAPER_U_SPAN = 1200.0
 def random_unit(rng: np.random.Generator) -> UnitDescription:
     """Draw a unit of 200 to 660 MW with 2 to 6 pieces and 1 to 3 regions.
 
-    Its curve covers what its load programme visits: an opening of 60 to 72 %
-    at the lowest load and pressure, of 88 to 95 % at full load. Neighbouring
-    slopes differ by a factor of 1.33 at least. Sampled at 1 or 2 s.
+    Its curve covers the range of its load programme: an opening of 60 to 72 %
+    at the lowest load and pressure, and of 88 to 95 % at full load. Neighbouring
+    slopes differ by a factor of at least 1.33. The sample period is 1 or 2 s.
     """
     rated = rng.uniform(200.0, 660.0)
     pressure_low, pressure_high = rng.uniform(8.5, 11.5), rng.uniform(15.5, 17.0)
@@ -279,12 +279,12 @@ def random_unit(rng: np.random.Generator) -> UnitDescription:
 
 
 def _curve(rng: np.random.Generator, rated: float, u_low: float, u_full: float) -> Curve:
-    """Draw a continuous curve whose inner knots all lie where the unit works."""
+    """Draw a continuous curve with all inner knots in the operating range of the unit."""
     J = int(rng.integers(2, 7))
     widths = 0.6 / J + 0.4 * rng.dirichlet(np.full(J, 2.0))
     slopes = [1.0]
     for _ in range(J - 1):
-        # Mostly flatter and flatter; now and then the next valve opens late.
+        # The slopes mostly decrease; sometimes the next valve opens late.
         flatter = rng.random() < 0.8 and slopes[-1] > 0.08
         slopes.append(slopes[-1] * rng.uniform(*((0.4, 0.75) if flatter else (1.35, 1.8))))
     inner = np.append(0.0, np.cumsum(widths))
@@ -296,7 +296,7 @@ def _curve(rng: np.random.Generator, rated: float, u_low: float, u_full: float) 
 
 
 def _reaching_further(curve: Curve, margin: float) -> Curve:
-    """Move the outermost knots outwards on their pieces: noise carries u beyond them."""
+    """Move the outermost knots outwards on their pieces, because noise moves u beyond them."""
     knots: FloatArray = curve.knots.copy()
     knots[0] -= margin
     knots[-1] += margin
@@ -304,7 +304,7 @@ def _reaching_further(curve: Curve, margin: float) -> Curve:
 
 
 def _regions(rng: np.random.Generator, low: float, full: float) -> tuple[Region, ...]:
-    """Draw one to three regions, the slower the higher."""
+    """Draw one to three regions; those at higher power are slower."""
     count = int(rng.integers(1, 4))
     inner = low + (np.arange(1, count) + rng.uniform(-0.2, 0.2, count - 1)) / count * (full - low)
     regions = []
@@ -316,7 +316,7 @@ def _regions(rng: np.random.Generator, low: float, full: float) -> tuple[Region,
 
 
 def _noise(rng: np.random.Generator, rated: float) -> Noise:
-    """Draw disturbances from half to one and a half times the paper's unit's."""
+    """Draw disturbances of 0.5 to 1.5 times those of the paper's unit."""
     scale = rated / _PAPER_RATED_MW
     return Noise(
         slow_mw=2.0 * scale * rng.uniform(0.5, 1.5),
@@ -334,7 +334,7 @@ def _programme(
     pressures_mpa: tuple[float, float],
     u_span: float,
 ) -> Programme:
-    """Scale the habits of the paper's unit to another one, with other weather and grid."""
+    """Scale the programme of the paper's unit to another unit, with other weather and grid."""
     low, near_full, full = loads_mw
     scale = (full - low) / _PAPER_LOAD_SPAN_MW
     return Programme(

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The streaming piecewise linear representation of u and power, row by row.
 
-Rows are averaged over short blocks. A straight line of u grows from the last
-break; the block that leaves it, twice in a row or by a mean over a minute, is
-the next break. After a break the first 5 T + tau are transient, eq. (13) of
-the paper, and do not count; from then on a line of the power grows as well,
-and leaving that one is a break too. What lies between the end of the transient
-and the next break is judged by `judge`.
+Rows are averaged over short blocks. A straight line is fitted to u from the last
+break on. The next break is where two consecutive blocks or a mean over a minute
+deviate from the line. After a break the first 5 T + tau are transient, eq. (13)
+of the paper, and are ignored. From then on a line is also fitted to the power,
+and a deviation from it is a break, too. The blocks between the end of the
+transient and the next break are classified by `judge`.
 
 All state lives in three arrays, so that it can be copied, saved and compared.
 """
@@ -21,11 +21,11 @@ import numpy as np
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
-# A straight line through points that arrive one by one, in constant time.
+# Recursive fit of a straight line to points, in constant time per point.
 
 
 # A line is five running sums over (k, v), k = 0, 1, 2, ... and v taken
-# relative to the first point, so that a large offset costs no digits.
+# relative to the first point, so that a large offset causes no loss of digits.
 N, ORIGIN, SV, SKV, SVV = range(5)
 LINE_SIZE = 5
 
@@ -75,8 +75,8 @@ def line_fit(line: FloatArray) -> tuple[float, float, float]:
 def line_ahead(line: FloatArray, steps: float) -> tuple[float, float]:
     """Extrapolate to ``steps`` points after the last one.
 
-    Returns the value and the factor on the noise sd that the error of a new
-    point there has, ``sqrt(1 + leverage)``.
+    Return the value, and the ratio ``sqrt(1 + leverage)`` of the error of a new
+    point there to the noise sd.
     """
     mean, slope, _ = line_fit(line)
     n = line[N]
@@ -86,28 +86,28 @@ def line_ahead(line: FloatArray, steps: float) -> tuple[float, float]:
     return mean + slope * x, math.sqrt(1.0 + leverage)
 
 
-# The signals' own noise, learnt while they stream by.
+# Online estimate of the signals' noise.
 #
 # Each stretch of `WINDOW` block means gives one rms about its own straight line.
-# Those numbers go into a histogram on a log scale, and the noise is a low
-# quantile of it: stretches with moves in them only fill its upper end. A
-# stretch of seven minutes is long enough to hold the wander of a valve under
-# load control, which shorter ones mistake for a trend.
+# These values are collected in a histogram on a log scale. The noise is a low
+# quantile of it: stretches that contain moves only fill its upper end. A stretch
+# of seven minutes is long enough to contain the slow motion of a valve under
+# load control; in a shorter one this motion would look like a trend.
 
-WINDOW = 42  # block means a stretch
+WINDOW = 42  # block means per stretch
 BINS = 480
 _PER_DECADE = 40.0
 _LOWEST = -6.0  # log10 of the histogram's lower end
 QUANTILE = 0.4
-WARM_UP = 4  # stretches before the noise is believed
-FORGET_AT = 4000.0  # stretches after which old ones count half (about three weeks)
+WARM_UP = 4  # minimum number of stretches for an estimate
+FORGET_AT = 4000.0  # stretches after which all counts are halved (about three weeks)
 
 
 @jit
 def noise_add(histogram: FloatArray, rms: float) -> None:
-    """Add one stretch's rms; halve everything when there is much of it.
+    """Add one stretch's rms; halve all counts when their sum is large.
 
-    A signal that stood still to the last digit teaches nothing of its noise.
+    An exactly constant signal contains no information on its noise.
     """
     if not 10.0**_LOWEST < rms < 10.0 ** (_LOWEST + BINS / _PER_DECADE):
         return
@@ -147,18 +147,18 @@ def noise_level(histogram: FloatArray) -> float:
 ) = range(11)
 INT_STATE = 11
 
-# The block that is filling: sums of u, power, temperature, and the count of temperatures.
+# The current block: sums of u, power, temperature, and the number of temperatures.
 BLOCK_T_COUNT = 3
 SUMS = 4
 
-# Rows of `lines`: of u up to now, of u up to a minute ago, of the power, of a stretch of each.
+# Rows of `lines`: u up to now, u up to a minute ago, power, and the noise stretch of each.
 LINE_U, LINE_U_BEHIND, LINE_Y, STRETCH_U, STRETCH_Y = range(5)
 LINES = 5
 
-# Rows of `blocks`: means of u, power and temperature of the segment that is open.
+# Rows of `blocks`: means of u, power and temperature of the open segment.
 BLOCK_U, BLOCK_Y, BLOCK_T = range(3)
 
-# Settings as the kernel wants them.
+# Settings in the form of the kernel.
 (
     BLOCK_ROWS,
     SETTLE,
@@ -175,12 +175,12 @@ BLOCK_U, BLOCK_Y, BLOCK_T = range(3)
 ) = range(12)
 SETTINGS_SIZE = 12
 
-_BEHIND = 6  # blocks whose mean is held against the line before them
-_BEHIND_LIMIT = 2.5  # in sd of that mean, were the blocks half as many and independent
-_LEAST = 6  # blocks before a line is believed
-_ROUGH = 2.0  # a segment rougher than this many noise sd is no straight line
+_BEHIND = 6  # blocks whose mean is compared with the line before them
+_BEHIND_LIMIT = 2.5  # in sd of that mean, with half the blocks taken as independent
+_LEAST = 6  # minimum number of blocks of a line
+_ROUGH = 2.0  # a segment with a larger rms residual, in noise sd, is no straight line
 
-# What a finished segment is described by.
+# Values that describe a finished segment.
 (
     SEG_FIRST,
     SEG_END,
@@ -195,22 +195,22 @@ _ROUGH = 2.0  # a segment rougher than this many noise sd is no straight line
 ) = range(10)
 SEG_SIZE = 10
 
-# What a row is, as far as can be told when it arrives.
+# Kind of a row, as far as known when it arrives.
 TRANSIENT, SETTLED_STEADY, SETTLED_SLOPE, NO_DATA = range(4)
 
 
 @jit
 def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float]:
-    """Return the noise sd of u and of the power, the given one before the learnt one."""
+    """Return the noise sd of u and of the power; a given value overrides the estimate."""
     u = setting[NOISE_U] if setting[NOISE_U] > 0.0 else noise_level(histograms[0])
     y = setting[NOISE_Y] if setting[NOISE_Y] > 0.0 else noise_level(histograms[1])
-    # Exact straight lines have no noise; rounding must not look like a break.
+    # Exact straight lines have no noise; their rounding must not cause a break.
     return max(u, 1e-6), max(y, 1e-6)
 
 
 @jit
 def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float, y: float) -> None:
-    """Put one block into the running stretch and close it when it is long enough."""
+    """Add one block to the current noise stretch and close it when it is long enough."""
     line_add(lines[STRETCH_U], u)
     line_add(lines[STRETCH_Y], y)
     state[IN_STRETCH] += 1
@@ -225,9 +225,9 @@ def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float,
 
 @jit
 def _begin(state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, skip: int) -> None:
-    """Begin a segment ``drop`` blocks after the old one's first, keeping the blocks behind.
+    """Begin a segment ``drop`` blocks after the old one's first, keeping the later blocks.
 
-    The first ``skip`` blocks do not count: they are transient, or counted before.
+    The first ``skip`` blocks are ignored: they are transient, or were used before.
     """
     keep = state[BLOCKS] - drop
     for k in range(keep):
@@ -245,7 +245,7 @@ def _begin(state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, sk
 
 @jit
 def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray) -> None:
-    """Let the lines take the block that stands at the end of ``blocks``."""
+    """Add the block at the end of ``blocks`` to the lines."""
     k = state[BLOCKS]
     line_add(lines[LINE_U], blocks[BLOCK_U, k])
     if k >= _BEHIND:
@@ -257,7 +257,7 @@ def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray) -> None:
 
 @jit
 def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int) -> int:
-    """Return the signed count of blocks in a row that left the line (0: it stays)."""
+    """Return the signed number of consecutive blocks that deviate from the line (0: none)."""
     if line[N] < _LEAST:
         return 0
     ahead, factor = line_ahead(line, 1.0)
@@ -272,7 +272,7 @@ def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int
 
 @jit
 def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool:
-    """Tell whether the last minute's mean left the line through what came before."""
+    """Return True if the last minute's mean deviates from the line through the earlier blocks."""
     behind = lines[LINE_U_BEHIND]
     if behind[N] < 2 * _BEHIND:
         return False
@@ -282,7 +282,7 @@ def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool
         off += blocks[BLOCK_U, k - _BEHIND + step] - ahead
     _, factor = line_ahead(behind, (_BEHIND + 1) / 2.0)
     leverage = factor * factor - 1.0
-    # Neighbouring blocks are correlated: six of them are taken for two.
+    # Neighbouring blocks are correlated: six of them count as two.
     sd = noise * math.sqrt(0.5 + _BEHIND * leverage / 2.0)
     return abs(off / _BEHIND) > _BEHIND_LIMIT * sd
 
@@ -297,7 +297,7 @@ def judge(
     setting: FloatArray,
     found: FloatArray,
 ) -> int:
-    """Judge the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
+    """Classify the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
     line = np.zeros((2, LINE_SIZE))
     temperature, known = 0.0, 0
     for k in range(first, end):
@@ -333,7 +333,7 @@ def _close(
     setting: FloatArray,
     found: FloatArray,
 ) -> bool:
-    """Judge what is open, up to block ``end``; True when it is a special segment."""
+    """Classify the open segment up to block ``end``; True if it is a special segment."""
     first = state[SKIP]
     least = min(setting[STEADY_MIN], setting[SLOPE_MIN])
     if end - first < max(least, 3):
@@ -345,7 +345,7 @@ def _close(
     found[SEG_FIRST] = state[FIRST_ROW] + first * rows
     found[SEG_END] = state[FIRST_ROW] + end * rows
     found[SEG_KIND] = kind
-    # The rows of a segment follow each other without a gap.
+    # The rows of a segment have no gap.
     behind = state[ROW] - state[FIRST_ROW] - end * rows
     state[END_NS] = state[LAST_NS] - behind * int(setting[PERIOD_NS])
     return True
@@ -360,14 +360,14 @@ def _take_block(
     setting: FloatArray,
     found: FloatArray,
 ) -> bool:
-    """Take the block at the end of ``blocks``; True when that closed a special segment."""
+    """Process the block at the end of ``blocks``; True if that closed a special segment."""
     settle = int(setting[SETTLE])
     rows = int(setting[BLOCK_ROWS])
     k = state[BLOCKS]
     u, y = blocks[BLOCK_U, k], blocks[BLOCK_Y, k]
     _learn(state, lines, histograms, u, y)
     if state[STRETCHES] < WARM_UP and (setting[NOISE_U] <= 0.0 or setting[NOISE_Y] <= 0.0):
-        # Without a noise level nothing can be judged: let the line start later.
+        # Without a noise level a break cannot be detected: start the line later.
         state[FIRST_ROW] += rows
         return False
     noise_u, noise_y = noise_now(histograms, setting)
@@ -383,7 +383,7 @@ def _take_block(
         return _cut_if_long(state, lines, blocks, noise_u, noise_y, setting, found)
     end = k - back - int(setting[TRIM])
     closed = _close(state, blocks, end, noise_u, noise_y, setting, found)
-    # What moved moved by now: the transient counts from the block before this one.
+    # The move happened before now: the transient begins at the previous block.
     at = max(k - 1, 0)
     state[FIRST_ROW] += at * rows
     state[BLOCKS] = k + 1
@@ -401,11 +401,11 @@ def _cut_if_long(
     setting: FloatArray,
     found: FloatArray,
 ) -> bool:
-    """Close a segment that has become too long; True when that made a special segment.
+    """Close a segment that has become too long; True if it is a special segment.
 
-    The next one goes on without a transient. Its line keeps some blocks from
-    before the cut, and the last minute is left to it, so that a move that began
-    there is still seen as a break.
+    The next one has no transient. Its line keeps some blocks from before the cut,
+    and the last minute belongs to it, so that a move that began there is still
+    detected as a break.
     """
     trim = int(setting[TRIM])
     if state[BLOCKS] < int(setting[LONGEST]) + state[SKIP] + trim:
@@ -422,7 +422,7 @@ def _cut_if_long(
 def _kind_now(
     state: IntArray, lines: FloatArray, histograms: FloatArray, setting: FloatArray
 ) -> int:
-    """Say what the newest row is, from what is known by now."""
+    """Return the kind of the newest row, as far as known now."""
     if state[BLOCKS] < max(state[SKIP], _LEAST):
         return TRANSIENT
     if state[RUN_U] != 0 or state[RUN_Y] != 0:
@@ -443,10 +443,10 @@ def _break_off(
     setting: FloatArray,
     found: FloatArray,
 ) -> bool:
-    """End what is open at a gap; nothing is known of what happened in it.
+    """Close the open segment at a gap, because the operation in the gap is unknown.
 
-    True when that closed a special segment; the row that shows the gap is not
-    taken yet.
+    Return True if that closed a special segment; the row after the gap is not
+    processed yet.
     """
     closed = False
     if state[BLOCKS] > 0:
@@ -456,7 +456,7 @@ def _break_off(
     state[FIRST_ROW] = state[ROW]
     state[ROWS_IN_BLOCK] = 0
     sums[:] = 0.0
-    # The stretch the noise is learnt from must not span a gap either.
+    # The stretch for the noise must not contain a gap either.
     state[IN_STRETCH] = 0
     line_reset(lines[STRETCH_U])
     line_reset(lines[STRETCH_Y])
@@ -476,7 +476,7 @@ def _take_row(
     setting: FloatArray,
     found: FloatArray,
 ) -> bool:
-    """Add a row to the block that is filling; True when that closed a special segment."""
+    """Add a row to the current block; True if that closed a special segment."""
     sums[BLOCK_U] += u
     sums[BLOCK_Y] += y
     if math.isfinite(temperature):
@@ -510,10 +510,10 @@ def run(
     kinds: ByteArray,
     found: FloatArray,
 ) -> tuple[int, bool]:
-    """Run over rows until they end or a special segment closes.
+    """Process rows until they end or a special segment closes.
 
-    Returns the rows consumed and whether ``found`` holds a segment, closed at
-    the last of them; ``kinds`` gets one code a row.
+    Return the number of rows processed, and whether ``found`` contains a segment that
+    closed at the last of them; one code per row is written to ``kinds``.
     """
     gap_ns = int(1.5 * setting[PERIOD_NS])
     for i in range(u.size):

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Find special segments while the data stream by (Section III.B of the paper)."""
+"""Online detection of special segments (Section III.B of the paper)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from valveflow_ros.state import Memory
 
 @dataclass(frozen=True, slots=True)
 class FoundSegment:
-    """A special segment and the rows it covers, counted from the first row ever fed."""
+    """A special segment and its row numbers, counted from the first row ever fed."""
 
     segment: SpecialSegment
     first_row: int
@@ -35,15 +35,15 @@ class FoundSegment:
 
 @dataclass(frozen=True, slots=True)
 class Segmented:
-    """What one call brought.
+    """The result of one call.
 
     Attributes
     ----------
     kinds : uint8 (n,)
-        For each row what it is as far as could be told when it arrived:
+        Kind of each row, as far as known when it arrived:
         `kernel.TRANSIENT`, `SETTLED_STEADY`, `SETTLED_SLOPE` or `NO_DATA`.
     found : list of (row, FoundSegment)
-        Segments closed, each with the number of rows of this call it took.
+        Closed segments, each with the number of rows of this call processed by then.
     """
 
     kinds: ByteArray
@@ -51,13 +51,13 @@ class Segmented:
 
     @property
     def rows(self) -> int:
-        """Return the number of rows taken."""
+        """Return the number of rows processed."""
         return len(self.kinds)
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseLevel:
-    """The noise the thresholds stand on, as sd of block means about a line."""
+    """The noise for the thresholds: sd of block means about a line."""
 
     input: float
     power_mw: float
@@ -65,7 +65,7 @@ class NoiseLevel:
 
 
 class Segmenter(Memory):
-    """Streaming segmentation in constant time a row and bounded memory.
+    """Online segmentation in constant time per row and bounded memory.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ class Segmenter(Memory):
 
     Notes
     -----
-    Any cutting of the rows into calls of `feed` gives the same segments and
-    the same kinds, bit for bit.
+    The segments and kinds do not depend on the division of the rows into calls
+    of `feed`; they are identical bit for bit.
     """
 
     REMEMBERED = ('_state', '_sums', '_lines', '_blocks', '_histograms', '_number')
@@ -94,7 +94,7 @@ class Segmenter(Memory):
         setting[kernel.LONGEST] = max(6, in_blocks(settings.real('longest_segment')))
         setting[kernel.STEADY_MIN] = max(3, in_blocks(settings.real('steady_min')))
         setting[kernel.SLOPE_MIN] = max(3, in_blocks(settings.real('slope_min')))
-        # A ramp is seen only after it has left the noise: up to a minute belongs to it already.
+        # A ramp is detected only when it exceeds the noise: up to a minute before belongs to it.
         setting[kernel.TRIM] = min(6, in_blocks(60.0))
         setting[kernel.BREAK] = settings.real('break_limit')
         setting[kernel.STEADY] = settings.real('steady_limit')
@@ -126,20 +126,20 @@ class Segmenter(Memory):
         next_number: int,
         found_before: int = 0,
     ) -> tuple[Segmenter, list[FoundSegment]]:
-        """Return a segmenter that has followed rows of the past, and what it found in them.
+        """Return a segmenter that has processed past rows, and the segments found in them.
 
         Parameters
         ----------
         settings : Settings
         number : int64 (n,)
-            Numbers of the rows, rising. Where some are missing nothing goes on.
+            Numbers of the rows, increasing. A missing number ends the open segment.
         time_ns : int64 (n,)
         values : float64 (3, n)
             ``u``, power in MW and temperature in degC, as for `feed`.
         next_number : int
-            Of the row that it is to be fed next.
+            Number of the row that will be fed next.
         found_before : int
-            Segments are numbered on from here.
+            Number of segments found before; the numbering continues from it.
         """
         made = cls(settings)
         made._number = found_before
@@ -150,7 +150,7 @@ class Segmenter(Memory):
             made._state[[kernel.ROW, kernel.FIRST_ROW]] = number[start]
             found += [f for _, f in made.feed(time_ns[start:end], *values[:, start:end]).found]
             if number[end - 1] + 1 != (next_number if end == len(number) else number[end]):
-                # A row without data ends what is open.
+                # A row without data ends the open segment.
                 after_ns = time_ns[end - 1 : end] + period_ns
                 found += [f for _, f in made.feed(after_ns, *np.full((3, 1), math.nan)).found]
         made._state[[kernel.ROW, kernel.FIRST_ROW]] += next_number - made._state[kernel.ROW]
@@ -171,7 +171,7 @@ class Segmenter(Memory):
         temperature_degc: FloatArray,
         most: int | None = None,
     ) -> Segmented:
-        """Take rows; NaN in ``u`` or ``power_mw`` marks a row without usable data.
+        """Process rows; NaN in ``u`` or ``power_mw`` marks a row without usable data.
 
         Parameters
         ----------
@@ -180,8 +180,8 @@ class Segmenter(Memory):
             Integrated input, % MPa^m.
         power_mw, temperature_degc : float64 (n,)
         most : int, optional
-            Stop right after the row that closed this many segments; the rest
-            of the rows is not taken.
+            Stop after the row that closed this many segments; the remaining
+            rows are not processed.
         """
         kinds = np.empty(len(u), dtype=np.uint8)
         found: list[tuple[int, FoundSegment]] = []
@@ -209,7 +209,7 @@ class Segmenter(Memory):
         return Segmented(kinds[:done], found)
 
     def _describe(self) -> FoundSegment:
-        """Turn the kernel's numbers into a record."""
+        """Convert the kernel's numbers into a record."""
         f = self._found
         first, end = int(f[kernel.SEG_FIRST]), int(f[kernel.SEG_END])
         period_ns = round(self._period_s * NS_PER_S)

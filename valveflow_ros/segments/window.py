@@ -33,9 +33,9 @@ def segment_values(segment: SpecialSegment) -> list[int | float]:
 
 
 def segment_of(values: list[Any]) -> SpecialSegment:
-    """Return the segment of such values; raises `DataError` if they make none."""
+    """Return the segment with these values; raise `DataError` if they are invalid."""
     try:
-        # States of earlier versions have no openings and pressures.
+        # States of earlier versions contain no openings and pressures.
         given = dict(zip(_NAMES, values, strict=len(values) != _WITHOUT_ENDS))
         return SpecialSegment(**{**given, 'kind': SegmentKind(given['kind'])})
     except (TypeError, ValueError):
@@ -48,32 +48,32 @@ def found_values(found: FoundSegment) -> list[Any]:
 
 
 def found_of(values: list[Any]) -> FoundSegment:
-    """Return the segment of such values; raises `DataError` if they make none."""
+    """Return the segment with these values; raise `DataError` if they are invalid."""
     if [type(row) for row in values[:2]] != [int, int]:
         raise DataError('The saved state has a segment whose rows are no numbers.')
     return FoundSegment(segment_of(values[2:]), values[0], values[1])
 
 
 _FIRST_ROOM = 16384
-# A clock that went back is believed when so much of the new time has come.
+# A step back of the clock is accepted after this much of the new time.
 _DOUBT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class WindowContents:
-    """A copy of what the window holds.
+    """A copy of the contents of the window.
 
     Attributes
     ----------
     time_ns : int64 (n,)
     u, power_mw, temperature_degc : float64 (n,)
-        NaN in ``u`` or ``power_mw`` where a row has no usable data.
+        NaN in ``u`` or ``power_mw`` if a row has no usable data.
     spans : int64 (k, 3)
         Special segments as (first row, end row, kind), rows counted within these arrays.
     opening_percent : float64 (n,) or (0,)
-        The opening that u was made from, NaN where it was not given; empty where unknown.
+        The opening from which u was computed, NaN if it was not given; empty if unknown.
     command_percent : float64 (n,) or (0,)
-        The commanded opening, NaN where there was none; empty where there never was.
+        The commanded opening, NaN if there was none; empty if there never was one.
     """
 
     time_ns: IntArray
@@ -85,7 +85,7 @@ class WindowContents:
     command_percent: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def special_rows(self) -> IntArray:
-        """Return the rows that lie in special segments, in order of time."""
+        """Return the rows in special segments, in chronological order."""
         if not len(self.spans):
             return np.empty(0, dtype=np.int64)
         return np.concatenate([np.arange(a, b, dtype=np.int64) for a, b, _ in self.spans])
@@ -106,7 +106,7 @@ NO_ROWS = WindowContents(
 
 @dataclass(slots=True)
 class _Aside:
-    """Rows that the clock had passed when it went back to a time, and the segments among them."""
+    """Rows after the time to which the clock was set back, and the segments in them."""
 
     from_ns: int
     time_ns: IntArray
@@ -120,25 +120,25 @@ class _Aside:
 
 
 class RollingWindow:
-    """Rows of the last days, and the special segments among them.
+    """Rows of the last days, and the special segments in them.
 
     Parameters
     ----------
     window_s, period_s : float
-        Length of the window and step of the rows; together they bound the memory.
+        Length of the window and step of the rows; together they limit the memory.
     exponent : float
         m of the u = V p^m of the rows.
     least_s : mapping of SegmentKind to float, optional
-        Shortest segment of a kind that is kept where a step of the clock cuts it.
+        Minimum length of a segment of a kind that is kept if a clock step cuts it.
 
     Notes
     -----
-    A clock that goes back may do so for good, or because a gateway has not heard the time yet.
-    So the rows it had passed are set aside. They come back when the time leaps over them by at
-    least half of what it went back, in place of the rows since; they are let go when as many
-    rows have come, or an hour of them.
-    What a leap ahead puts outside the window stays among the last rows, so many as fill a
-    window without gaps, and is inside again when the leap is taken back.
+    A clock may be set back permanently, or temporarily because a gateway has no time yet. So the
+    rows after the new time are set aside. They replace the newer rows when the time jumps forward
+    again by at least half of the step back. They are discarded after as many new rows, or one
+    hour of them.
+    After a jump ahead, old rows outside the window are kept, as many as fill a window without
+    gaps. They are inside the window again if the jump is reversed.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class RollingWindow:
         self._period_ns = round(period_s * NS_PER_S)
         self._doubt = max(1, math.ceil(_DOUBT_S / period_s))
         self._rows = max(16, math.ceil(window_s / period_s) + 1)
-        # Rows are dropped a sixteenth of the window at a time.
+        # Rows are dropped in parts of a sixteenth of the window.
         self._most_room = self._rows * 17 // 16 + 16
         self._seen = 0
         self._segments: deque[FoundSegment] = deque()
@@ -177,7 +177,7 @@ class RollingWindow:
         )  # fmt: skip
 
     def __len__(self) -> int:
-        """Return the number of rows held, without those set aside."""
+        """Return the number of rows stored, without those set aside."""
         return self._end
 
     @property
@@ -186,7 +186,7 @@ class RollingWindow:
         return len(self.special_segments())
 
     def special_segments(self, since_ns: int = 0) -> tuple[SpecialSegment, ...]:
-        """Return the special segments inside the window that began since then, in order."""
+        """Return the special segments inside the window that began since a time, in order."""
         return tuple(f.segment for f in self._inside() if f.segment.start_ns >= since_ns)
 
     @property
@@ -211,7 +211,7 @@ class RollingWindow:
         opening_percent: FloatArray | None = None,
         command_percent: FloatArray | None = None,
     ) -> None:
-        """Append rows that follow each other in time; those outside the window are forgotten."""
+        """Append rows in chronological order; rows outside the window are dropped."""
         data = np.full((5, len(time_ns)), np.nan)
         data[0], data[1], data[2] = u, power_mw, temperature_degc
         if opening_percent is not None:
@@ -227,9 +227,9 @@ class RollingWindow:
         self._forget()
 
     def add_segment(self, found: FoundSegment) -> None:
-        """Remember a special segment that has closed.
+        """Add a special segment that has closed.
 
-        Of one that was open when the clock went back the part before that stays.
+        If it was open when the clock was set back, only the part before that is kept.
         """
         aside = self._aside
         if aside is not None and _has(aside.number, found.end_row - 1):
@@ -238,9 +238,9 @@ class RollingWindow:
         self._forget()
 
     def _part(self, found: FoundSegment) -> list[FoundSegment]:
-        """Return the part of a segment whose rows are held; none if it is too short for one.
+        """Return the part of a segment whose rows are stored; none if the part is too short.
 
-        What is cut off goes on in a straight line with what is left.
+        Its ends are taken from the straight line of the segment.
         """
         number, s = self._number[: self._end], found.segment
         first, end = (int(k) for k in np.searchsorted(number, (found.first_row, found.end_row)))
@@ -259,7 +259,7 @@ class RollingWindow:
         return [self._with_ends(cut, number, self._data[:, : self._end])]
 
     def _with_ends(self, found: FoundSegment, number: IntArray, data: FloatArray) -> FoundSegment:
-        """Return a segment with opening and pressure at the ends of a line through its rows."""
+        """Return a segment with opening and pressure at its ends from lines through its rows."""
         first, end = np.searchsorted(number, (found.first_row, found.end_row))
         u, opening = data[0, first:end], data[3, first:end]
         pressure = pressure_of(u, opening, self._exponent)
@@ -276,12 +276,12 @@ class RollingWindow:
         ))  # fmt: skip
 
     def go_back(self, time_ns: int) -> None:
-        """Set aside the rows from a time on, to which the clock went back."""
+        """Set aside the rows from the time on to which the clock was set back."""
         self._drop_oldest()
         cut = int(np.searchsorted(self._time_ns[: self._end], time_ns, side='left'))
         old, stop = self._aside, self._end
         if old is not None:
-            # What came since the clock went back before is neither here nor there.
+            # Rows since an earlier step back belong to neither of the two times: drop them.
             stop = cut + int(np.searchsorted(self._number[cut : self._end], old.number[0]))
         passed = _Aside(
             time_ns, self._time_ns[cut:stop].copy(), self._number[cut:stop].copy(),
@@ -295,7 +295,7 @@ class RollingWindow:
             if found.segment.end_ns < time_ns:
                 stay.append(found)
                 continue
-            # What an earlier step back has cut is set aside as a whole already.
+            # A segment cut by an earlier step back is already set aside as a whole.
             if found.end_row - 1 <= newest and found.first_row not in known:
                 passed.segments.append(found)
             stay.extend(self._part(found))
@@ -316,13 +316,13 @@ class RollingWindow:
         return self._number[self._first() : self._end].copy()
 
     def tail(self, rows: int) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """Return copies of time, ``u``, power and opening of the last ``rows`` rows held."""
+        """Return copies of time, ``u``, power and opening of the last ``rows`` stored rows."""
         part = slice(max(0, self._end - rows), self._end)
         u, power, opening = (self._data[k, part].copy() for k in (0, 1, 3))
         return self._time_ns[part].copy(), u, power, opening
 
     def contents(self, since_ns: int = 0) -> WindowContents:
-        """Return a copy of the rows inside the window since then, and their segments."""
+        """Return a copy of the rows inside the window since a time, and their segments."""
         since = int(np.searchsorted(self._time_ns[: self._end], since_ns))
         inside = slice(max(self._first(), since), self._end)
         number = self._number[inside]
@@ -341,12 +341,12 @@ class RollingWindow:
             self._data[2, inside].copy(),
             np.array(spans, dtype=np.int64).reshape(-1, 3),
             self._data[3, inside].copy(),
-            # Most units do not log it, and a snapshot goes to another process.
+            # Most units do not log the command, and a snapshot is sent to another process.
             command.copy() if np.isfinite(command).any() else np.empty(0),
         )
 
     def snapshot(self) -> State:
-        """Return what is remembered."""
+        """Return the state to be saved."""
         rows, aside = self._held(), self._aside
         return {
             'seen': self._seen,
@@ -360,7 +360,7 @@ class RollingWindow:
         }  # fmt: skip
 
     def restore(self, saved: State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raise `DataError` if it is invalid."""
         rows, aside = _rows_of(saved), perhaps(saved, 'aside', dict)
         self._clear()
         self._seen = perhaps(saved, 'seen', int) or 0
@@ -371,17 +371,17 @@ class RollingWindow:
     def find_segments_anew(
         self, settings: Settings, exponent: float, found_before: int
     ) -> Segmenter:
-        """Let the segments be those that these settings find; return what goes on finding them.
+        """Replace the segments by those found with these settings; return the segmenter.
 
-        Rows set aside are forgotten.
+        Rows set aside are dropped.
 
         Parameters
         ----------
         settings : Settings
         exponent : float
-            m of the u = V p^m that the rows have; it becomes that of the window.
+            New m of u = V p^m of the rows; it becomes that of the window.
         found_before : int
-            Segments are numbered on from here.
+            Number of segments found before; the numbering continues from it.
         """
         rows = slice(0, self._end)
         if exponent != self._exponent:
@@ -401,7 +401,7 @@ class RollingWindow:
         return segmenter
 
     def _clear(self) -> None:
-        """Hold nothing."""
+        """Remove all rows and segments."""
         self._room = min(_FIRST_ROOM, self._most_room)
         self._time_ns = np.empty(self._room, dtype=np.int64)
         self._number = np.empty(self._room, dtype=np.int64)
@@ -409,7 +409,7 @@ class RollingWindow:
         self._end = 0
 
     def _add(self, time_ns: IntArray, number: IntArray, data: FloatArray) -> None:
-        """Append rows to those held."""
+        """Append rows to the stored ones."""
         done = 0
         while done < len(time_ns):
             if self._end == self._room:
@@ -424,8 +424,8 @@ class RollingWindow:
     def _append_in_doubt(
         self, aside: _Aside, time_ns: IntArray, number: IntArray, data: FloatArray, done: int
     ) -> int:
-        """Append rows until it is settled whether the clock went back for good."""
-        # Rows that a further step back has thrown out count too, or it would never be settled.
+        """Append rows until it is decided whether the step back of the clock is permanent."""
+        # Rows dropped by a further step back count, too; otherwise there might be no decision.
         since = int(number[done] - aside.number[-1]) - 1
         enough = done + min(len(aside), self._doubt) - since
         over = done + int(np.searchsorted(time_ns[done:], aside.time_ns[-1], side='right'))
@@ -436,13 +436,13 @@ class RollingWindow:
         elif until == over and until < len(time_ns):
             before_ns = self._time_ns[self._end - 1] if self._end else 0
             self._aside = None
-            # Who returns leaps as far as the clock went back; less is a gap in the new time.
+            # A return to the old time is a jump as large as the step back; a smaller one is a gap.
             if time_ns[over] - before_ns > (aside.time_ns[-1] - aside.from_ns) // 2:
                 self._take_back(aside)
         return until
 
     def _take_back(self, aside: _Aside) -> None:
-        """Put the rows set aside in the place of those since."""
+        """Replace the newer rows by the rows set aside."""
         last = aside.number[-1]
         self._end = int(np.searchsorted(self._number[: self._end], last))
         whole = {found.first_row for found in aside.segments}
@@ -453,18 +453,18 @@ class RollingWindow:
         self._add(aside.time_ns, aside.number, aside.data)
 
     def _inside(self) -> list[FoundSegment]:
-        """Return the segments inside the window, in order of time."""
+        """Return the segments inside the window, in chronological order."""
         if not self._end:
             return []
         oldest = int(self._time_ns[self._end - 1]) - self._window_ns
         return [found for found in self._segments if found.segment.start_ns > oldest]
 
     def _held(self) -> slice:
-        """Return the places of the last rows, as many as a full window has."""
+        """Return the slice of the last rows, as many as a full window has."""
         return slice(max(0, self._end - self._rows), self._end)
 
     def _first(self) -> int:
-        """Return the place of the oldest row inside the window."""
+        """Return the index of the oldest row inside the window."""
         if self._end == 0:
             return 0
         held = self._held()
@@ -472,14 +472,14 @@ class RollingWindow:
         return int(held.start + np.searchsorted(self._time_ns[held], oldest, side='right'))
 
     def _make_room(self) -> None:
-        """Grow until the window fits, then drop the oldest rows many at a time."""
+        """Enlarge the arrays up to the window's size, then drop old rows, many at a time."""
         if self._room < self._most_room:
             self._resize(min(self._most_room, 2 * self._room))
             return
         self._drop_oldest()
 
     def _drop_oldest(self) -> None:
-        """Keep as many rows as a full window has."""
+        """Drop the oldest rows, keeping as many as a full window has."""
         if self._end <= self._rows:
             return
         held = self._held()
@@ -489,7 +489,7 @@ class RollingWindow:
         self._end = self._rows
 
     def _give_back_room(self) -> None:
-        """Need less memory where few rows are left, since those set aside need theirs."""
+        """Shrink the arrays if few rows are left, because the rows set aside need memory, too."""
         if self._room > _FIRST_ROOM and 4 * self._end < self._room:
             self._resize(min(self._most_room, max(_FIRST_ROOM, 2 * self._end)))
 
@@ -502,7 +502,7 @@ class RollingWindow:
         self._data[:, :end] = data[:, :end]
 
     def _forget(self) -> None:
-        """Let go of segments whose rows are gone."""
+        """Drop segments whose rows were dropped."""
         if not self._end:
             return
         first = int(self._number[self._held().start])
@@ -511,7 +511,7 @@ class RollingWindow:
 
 
 def _has(numbers: IntArray, number: int) -> bool:
-    """Tell whether a row is among some."""
+    """Return True if a row number is among the given ones."""
     place = int(np.searchsorted(numbers, number))
     return place < len(numbers) and int(numbers[place]) == number
 
@@ -530,7 +530,7 @@ def _plain(rows: _Aside) -> State:
 
 
 def _rows_of(saved: State) -> _Aside:
-    """Return rows and segments of plain values; raises `DataError` if they do not fit."""
+    """Return rows and segments from plain values; raise `DataError` if they are invalid."""
     time_ns, number, rows, command = (saved[n] for n in ('time_ns', 'number', 'rows', 'command'))
     n = len(time_ns)
     if rows.shape != (4, n) or len(number) != n or len(command) not in (0, n):

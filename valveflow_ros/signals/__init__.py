@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Signals: alignment of readings into rows, and units."""
+"""Alignment of readings into rows, and units."""

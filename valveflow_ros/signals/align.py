@@ -1,15 +1,15 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Asynchronous signals become one table on a time grid.
+"""Alignment of asynchronous signals to one table on a time grid.
 
-A row stands at each multiple of the sample period. It holds, for each signal,
-the newest value whose stamp is not after the row (zero-order hold), as long as
-that value is not older than the hold limit. A row is closed as soon as every
-required signal has spoken after it, or when any signal is `lateness` past it.
-Which rows come out, and what stands in them, depends only on the readings in
-their order, so a recording gives back the rows of the live run.
+There is a row at each multiple of the sample period. It contains, for each signal,
+the newest value with a stamp not after the row (zero-order hold), unless that value
+is older than the hold limit. A row is closed as soon as every required signal has a
+reading after it, or when any signal is later than the row by `lateness`. The rows
+depend only on the readings and their order, so a replay of a recording gives the
+same rows as the live run.
 
-Nothing is dropped without a count; see `REASONS`.
+All dropped readings are counted; see `REASONS`.
 """
 
 from __future__ import annotations
@@ -38,42 +38,42 @@ from valveflow_ros.records import (
     Signal,
 )
 
-# The loop that turns readings into rows; see `valveflow_ros.signals.align` for the rules.
+# The loop that converts readings into rows; the module docstring describes the rules.
 
 REASONS = (
-    'accepted',  # taken into the table
+    'accepted',  # used for the table
     'not_finite',  # NaN or infinite
-    'bad_quality',  # the sender itself calls it bad, or does not say
+    'bad_quality',  # marked as bad or without a quality by the sender
     'impossible',  # outside the plausible range of its signal
-    'duplicate',  # same stamp as the one before
+    'duplicate',  # same stamp as the previous one
     'out_of_order',  # older than the newest of its own signal
-    'time_outlier',  # stamp impossible, or far from everybody else's and not confirmed
-    'late',  # taken, but rows it belonged to were closed already
+    'time_outlier',  # stamp impossible, or far from the others and not confirmed
+    'late',  # used, but its rows were closed already
 )
 _ACCEPTED, _NOT_FINITE, _BAD, _IMPOSSIBLE, _DUPLICATE, _ORDER, _OUTLIER, _LATE = range(8)
 
-_AHEAD_CONFIRMED = 3  # instants that must agree before a leap forward is believed
-BEHIND_CONFIRMED = 20  # and before the clock is believed to have gone back
+_AHEAD_CONFIRMED = 3  # instants that must agree before a jump forward is accepted
+BEHIND_CONFIRMED = 20  # the same for a step back
 NEVER = np.iinfo(np.int64).min
 _LATEST_NS = 2**62  # the year 2116; later stamps would overflow
 
-# Places in the clock.
+# Indices in the clock array.
 _NEXT, NEWEST, _WAITING, _BELIEVED, _RESETS = range(5)
 
 
 class State(NamedTuple):
-    """All the kernel remembers, as arrays it writes."""
+    """The state of the kernel: arrays that it changes."""
 
-    clock: IntArray  # next row, newest stamp accepted, readings waiting, of them believed, resets
+    clock: IntArray  # next row, newest accepted stamp, waiting readings, confirmed ones, resets
     newest_ns: IntArray  # (5,) newest stamp of each signal
     held_ns: IntArray  # (5,) the newest value not after the next row
     held: FloatArray
     held_quality: ByteArray
-    open_row: IntArray  # (5, spare) values for rows still open: number of the row, stamp, value
+    open_row: IntArray  # (5, spare) values for open rows: row number, stamp, value
     open_ns: IntArray
     open_value: FloatArray
     open_quality: ByteArray
-    wait_ns: IntArray  # readings far off in time, waiting for others like them
+    wait_ns: IntArray  # readings far off in time, waiting for confirmation
     wait_signal: IntArray
     wait: FloatArray
     wait_quality: ByteArray
@@ -81,7 +81,7 @@ class State(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What the kernel goes by."""
+    """The settings of the kernel."""
 
     limits: FloatArray  # (5, 2) plausible range of each signal
     required: ByteArray  # (5,)
@@ -89,11 +89,11 @@ class Rules(NamedTuple):
     lateness_ns: int
     hold_ns: int
     jump_ns: int
-    spare: int  # rows that may stand open at a time
+    spare: int  # maximum number of open rows
 
 
 class AlignedRows(NamedTuple):
-    """Room for what comes out."""
+    """Output arrays of the kernel."""
 
     time_ns: IntArray
     values: FloatArray
@@ -103,7 +103,7 @@ class AlignedRows(NamedTuple):
 
 @inlined
 def _accept(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> None:
-    """Take one checked reading: hold it, or keep it for the open row it belongs to."""
+    """Accept one checked reading: as held value, or for the open row to which it belongs."""
     if time_ns <= state.newest_ns[s]:
         why = _DUPLICATE if time_ns == state.newest_ns[s] else _ORDER
         state.counts[s, why] += 1
@@ -127,12 +127,12 @@ def _accept(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) 
 
 @inlined
 def _can_close(state: State, rules: Rules) -> bool:
-    """Tell whether the next row can no longer change."""
+    """Return True if the next row can no longer change."""
     tick = state.clock[_NEXT]
     if state.clock[NEWEST] >= tick + rules.lateness_ns:
         return True
     for s in range(state.newest_ns.size):
-        # An optional signal is waited for only while it is being sent.
+        # Wait for an optional signal only while it is being sent.
         expected = rules.required[s] or state.newest_ns[s] >= tick - rules.hold_ns
         if expected and state.newest_ns[s] < tick:
             return False
@@ -141,7 +141,7 @@ def _can_close(state: State, rules: Rules) -> bool:
 
 @inlined
 def _close(state: State, rules: Rules, rows: AlignedRows, place: int, coming_ns: int) -> bool:
-    """Write the next row, if anybody has spoken lately, and go on to the one after it.
+    """Write the next row, if there was a recent reading, and advance to the following one.
 
     ``coming_ns`` is the stamp of a reading that is about to be accepted.
     """
@@ -164,7 +164,7 @@ def _close(state: State, rules: Rules, rows: AlignedRows, place: int, coming_ns:
     if alive:
         rows.time_ns[place] = tick
         return True
-    # Nobody has spoken for long: the grid goes on where somebody does.
+    # After a long time without readings the grid continues at the next reading.
     first = coming_ns
     for s in range(state.held_ns.size):
         for j in range(rules.spare):
@@ -178,7 +178,7 @@ def _close(state: State, rules: Rules, rows: AlignedRows, place: int, coming_ns:
 
 @jit
 def _drop_waiting(state: State) -> None:
-    """Count the readings that waited in vain."""
+    """Drop and count the waiting readings that were not confirmed."""
     for k in range(state.clock[_WAITING]):
         state.counts[state.wait_signal[k], _OUTLIER] += 1
     state.clock[_WAITING] = 0
@@ -186,7 +186,7 @@ def _drop_waiting(state: State) -> None:
 
 @jit
 def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> int:
-    """Let a reading far off in time wait; 1 when a leap ahead is confirmed, -1 one back."""
+    """Add a reading far off in time to the waiting ones; 1 confirms a jump ahead, -1 one back."""
     clock = state.clock
     if clock[_WAITING] > 0:
         last = state.wait_ns[clock[_WAITING] - 1]
@@ -197,7 +197,7 @@ def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) ->
     state.wait[n], state.wait_quality[n] = v, q
     clock[_WAITING] = n + 1
     ahead = time_ns > clock[NEWEST]
-    # The values of one instant must not confirm each other: what counts is instants.
+    # Count different instants: values of one instant must not confirm each other.
     instants = 1
     for k in range(1, n + 1):
         if state.wait_ns[k] != state.wait_ns[k - 1]:
@@ -209,7 +209,7 @@ def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) ->
 
 @jit
 def _forget(state: State) -> None:
-    """Begin anew after the clock went back; what waits is believed."""
+    """Reset after a step back of the clock; the waiting readings are confirmed."""
     state.clock[_RESETS] += 1
     state.clock[NEWEST] = NEVER
     state.clock[_NEXT] = NEVER
@@ -222,10 +222,10 @@ def _forget(state: State) -> None:
 def _close_ready(
     state: State, rules: Rules, rows: AlignedRows, written: int, coming_ns: int, rest: bool
 ) -> int:
-    """Close rows while there is room; return the rows written by then.
+    """Close rows while there is space; return the number of rows written so far.
 
-    With ``coming_ns`` only rows that cannot be touched by that reading, with
-    ``rest`` all up to the newest stamp.
+    With ``coming_ns`` only rows that this reading cannot change are closed, with
+    ``rest`` all rows up to the newest stamp.
     """
     clock = state.clock
     while clock[_NEXT] != NEVER and written < rows.time_ns.size - rules.spare:
@@ -243,7 +243,7 @@ def _close_ready(
 
 @inlined
 def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
-    """Return why a reading is refused at the door, or `_ACCEPTED`."""
+    """Return why a reading is rejected, or `_ACCEPTED`."""
     if not 0 <= t < _LATEST_NS:
         return _OUTLIER
     if not math.isfinite(v):
@@ -255,9 +255,9 @@ def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
 
 @jit
 def _offer_believed(state: State, rules: Rules, rows: AlignedRows, written: int) -> int:
-    """Accept the readings whose leap is confirmed.
+    """Accept the readings of a confirmed jump.
 
-    Returns the rows written, or -1 - rows when room ended before all were accepted.
+    Return the rows written, or -1 - rows if space ended before all were accepted.
     """
     clock = state.clock
     while 0 <= clock[_BELIEVED] < clock[_WAITING]:
@@ -275,7 +275,7 @@ def _offer_believed(state: State, rules: Rules, rows: AlignedRows, written: int)
 
 @jit
 def _go_back(state: State, rules: Rules, rows: AlignedRows, written: int) -> int:
-    """Close what was open before the clock went back, as it stands, and begin anew."""
+    """Close the rows that were open before the step back with their present values, and reset."""
     clock = state.clock
     while clock[_NEXT] <= clock[NEWEST] and written < rows.time_ns.size:
         if _close(state, rules, rows, written, _LATEST_NS):
@@ -288,14 +288,14 @@ def _go_back(state: State, rules: Rules, rows: AlignedRows, written: int) -> int
 def _far(
     state: State, rules: Rules, rows: AlignedRows, written: int, t: int, s: int, v: float, q: int
 ) -> int:
-    """Deal with a reading far off in time; return the rows written."""
+    """Process a reading far off in time; return the rows written."""
     leap = _wait(state, rules, t, s, v, q)
     state.clock[_BELIEVED] = 0 if leap != 0 else -1
     return _go_back(state, rules, rows, written) if leap < 0 else written
 
 
 @jit
-def align(  # noqa: C901 - one loop over all that can meet a reading
+def align(  # noqa: C901 - one loop with all cases of a reading
     time_ns: IntArray,
     signal: NDArray[np.int8],
     value: FloatArray,
@@ -305,11 +305,11 @@ def align(  # noqa: C901 - one loop over all that can meet a reading
     rows: AlignedRows,
     final: bool,
 ) -> tuple[int, int, int]:
-    """Run over readings until they or the room for rows end.
+    """Process readings until they or the space for rows end.
 
-    Returns the readings consumed, the rows written and the restarts met.
+    Return the number of readings processed, of rows written and of resets.
     """
-    # Calls hand over many arrays, so the common path asks first whether one is needed.
+    # Calls with many arrays are slow, so the common path first checks if a call is needed.
     clock = state.clock
     limit = rows.time_ns.size - rules.spare
     written = resets = i = 0
@@ -350,12 +350,12 @@ def align(  # noqa: C901 - one loop over all that can meet a reading
 
 @dataclass(frozen=True, slots=True)
 class Aligned:
-    """What came out of one call: rows, and where a restart of the clock lies among them.
+    """The result of one call: rows, and the resets of the clock among them.
 
     Attributes
     ----------
     table : SampleTable
-        The rows closed.
+        The closed rows.
     resets : int64 (k,)
         Row numbers within ``table`` before which the clock was set back.
     """
@@ -365,7 +365,7 @@ class Aligned:
 
 
 class Aligner:
-    """Turn readings into rows, in one pass and bounded memory.
+    """Convert readings into rows, in one pass and bounded memory.
 
     Parameters
     ----------
@@ -373,7 +373,7 @@ class Aligner:
         Sample period, hold limit, lateness, clock jump, plausible ranges.
     """
 
-    _ROOM = 65536  # rows a single call of the kernel can write
+    _ROOM = 65536  # maximum number of rows of one call of the kernel
 
     def __init__(self, settings: Settings) -> None:
         period = settings.real('sample_period')
@@ -409,7 +409,7 @@ class Aligner:
         )
 
     def feed(self, readings: Readings) -> Aligned:
-        """Take readings in their order of arrival and return the rows they close."""
+        """Process readings in their order of arrival and return the rows that they close."""
         return self._run(readings, final=False)
 
     def finish(self) -> Aligned:
@@ -418,11 +418,11 @@ class Aligner:
 
     @property
     def newest_ns(self) -> int:
-        """Return the newest stamp taken, 0 before the first."""
+        """Return the newest accepted stamp, 0 before the first."""
         return max(0, int(self._state.clock[NEWEST]))
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return what became of the readings: ``{topic: {reason: count}}``."""
+        """Return the number of readings by result: ``{topic: {reason: count}}``."""
         counts = self._state.counts
         return {
             info.topic: {reason: int(counts[info.signal, k]) for k, reason in enumerate(REASONS)}
@@ -430,11 +430,11 @@ class Aligner:
         }
 
     def snapshot(self) -> state.State:
-        """Return what is remembered."""
+        """Return the state to be saved."""
         return state.copies(self._state._asdict())
 
     def restore(self, saved: state.State) -> None:
-        """Go on from a state; raises `DataError` if it does not fit."""
+        """Continue from a saved state; raise `DataError` if it is invalid."""
         state.put_back(self._state._asdict(), saved)
 
     def _run(self, readings: Readings, final: bool) -> Aligned:
@@ -466,7 +466,7 @@ class Aligner:
         return Aligned(table, np.array(resets, dtype=np.int64))
 
 
-# A whole log, without the engine, which takes long to load.
+# Alignment of a whole log without the engine, which takes long to load.
 
 _BLOCK = 200_000  # readings between two reports of progress
 
@@ -474,7 +474,7 @@ _BLOCK = 200_000  # readings between two reports of progress
 def align_whole(
     readings: Readings, settings: Settings, progress: Callable[[float, str], None] | None = None
 ) -> tuple[SampleTable, IntArray, dict[str, dict[str, int]]]:
-    """Return all rows, the rows before which the clock was set back, and the counts."""
+    """Return all rows, the row numbers before which the clock was set back, and the counts."""
     aligner = Aligner(settings)
     rows = gathered(aligned_blocks(aligner, readings, progress, 'putting rows together'))
     return rows.table, rows.resets, aligner.counts()
@@ -483,7 +483,7 @@ def align_whole(
 def aligned_blocks(
     aligner: Aligner, readings: Readings, progress: Callable[[float, str], None] | None, what: str
 ) -> Iterator[Aligned]:
-    """Yield the rows block by block, with those that only the end closes."""
+    """Yield the rows block by block, including those closed by the end of the log."""
     for start in range(0, len(readings), _BLOCK):
         if progress is not None:
             progress(0.1 + 0.4 * start / len(readings), what)
@@ -492,7 +492,7 @@ def aligned_blocks(
 
 
 def gathered(blocks: Iterable[Aligned]) -> Aligned:
-    """Return the rows of all blocks as one."""
+    """Return the rows of all blocks in one block."""
     tables: list[SampleTable] = []
     resets: list[int] = []
     before = 0

@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that a historian keeps by exception: each value stands until the next one.
+"""Signals that a historian stores by exception: each value is valid until the next one.
 
-Such a historian stores a value when a scan finds it farther than a dead band from the last one
-stored, or when that one is too old. Gaps are therefore irregular and changes are never small.
-Both must be seen in at least two of opening, pressure and power before a log is taken for one;
-any other log stays as it is.
+Such a historian stores a value if it differs by more than a dead band from the last stored one,
+or if that one is too old. The time steps are therefore irregular and changes are never small.
+A log is taken as compressed if both are found in at least two of opening, pressure and power;
+any other log is not changed.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from valveflow_ros.records import (
 _DECISIVE = (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE, Signal.GENERATED_POWER)
 _LEAST_VALUES = 60
 _LEAST_SIGNALS = 2
-_NEAR_MEDIAN = 0.25  # gaps that differ by less from the median are regular
+_NEAR_MEDIAN = 0.25  # relative difference from the median of regular time steps
 _REGULAR_SHARE = 0.6
-_LOW = 0.02  # quantile of the changes that is taken for the dead band
-_BAND_OF_MEDIAN = 0.4  # ordinary noise has hardly any change below so much of the median: 0.02
-_RESOLUTIONS = 5.0  # steps of the record in a dead band, where rows are regular
-# Where so many gaps lie within this factor, and so many times fewer within it again below them,
-# the historian stores a value because of its age.
+_LOW = 0.02  # quantile of the changes that is used as dead band
+_BAND_OF_MEDIAN = 0.4  # minimum ratio of dead band and median change; ordinary noise has 0.02
+_RESOLUTIONS = 5.0  # minimum dead band in resolution steps of the record, if rows are regular
+# The historian stores a value because of its age if this fraction of the gaps is within this
+# factor, and if this many times fewer gaps are within the same factor below them.
 _EDGE_LEAST, _EDGE_SHARE, _EDGE_WIDTH, _EDGE_RISE = 8, 0.001, 1.08, 3.0
 _NEARLY_ALL = 0.998
-_YOUNG = 0.75  # of the longest interval: below, a value is stored for its change
-_LATE = 1.1  # times the longest regular interval a value stands
-_SCAN = 0.05  # quantile of the gaps that is taken for the scan interval
-_OF_SCAN = 0.6  # longest step of rows, in scans of the quickest signal
+_YOUNG = 0.75  # of the longest interval: an earlier value is stored because of its change
+_LATE = 1.1  # validity of a value, in longest regular intervals
+_SCAN = 0.05  # quantile of the gaps that is used as scan interval
+_OF_SCAN = 0.6  # maximum step of rows, in scans of the fastest signal
 _ROUND_S = (1, 2, 5, 10, 15, 20, 30, 60)
 
 
 @dataclass(frozen=True, slots=True)
 class Updates:
-    """How one signal of a compressed log is kept.
+    """How one signal of a compressed log is stored.
 
     Attributes
     ----------
     interval_s : float
         Median time between values.
     dead_band : float
-        Smallest change that is kept, in the engine's unit.
+        Smallest change that is stored, in the engine's unit.
     """
 
     interval_s: float
@@ -67,13 +67,13 @@ class Compression:
     Attributes
     ----------
     updates : dict of Signal to Updates
-        Of the signals in which it was seen.
+        The signals in which compression was found.
     longest_s : float
-        Longest regular time between values; one that stands longer is missing.
+        Longest regular time between values; after a longer time the value is missing.
     step_s : float
-        Time between rows: of the log if it holds its values itself, else a sensible one.
+        Time between rows: that of the log if it repeats its values, else a suitable one.
     own_times : bool
-        Values stand at their own times; otherwise the rows of the log repeat them.
+        True if values have their own times; otherwise the rows of the log repeat them.
     """
 
     updates: dict[Signal, Updates]
@@ -88,7 +88,7 @@ class Compression:
 
     @property
     def sentence(self) -> str:
-        """Say how the log was kept."""
+        """Return a sentence on how the log was stored."""
         told = ', '.join(
             f'{SIGNALS[s].topic} typically every {u.interval_s:.0f} s, from changes of '
             f'{u.dead_band:.2g} {SIGNALS[s].unit} on'
@@ -105,12 +105,12 @@ class Compression:
 
 
 def find_compression(readings: Readings) -> Compression | None:
-    """Return how a log was compressed, None if it does not look so.
+    """Return how a log was compressed, None if it seems not compressed.
 
     Notes
     -----
-    A clock that goes back makes it an ordinary log. The longest regular interval is where
-    many gaps of all signals end together.
+    A log with a step back of the clock is not compressed. The longest regular interval is a
+    length that many gaps of all signals have.
     """
     series = {}
     for s, part in readings.by_signal().items():
@@ -125,7 +125,7 @@ def find_compression(readings: Readings) -> Compression | None:
     regular = [s for s in decisive if _is_regular(np.diff(series[s][0]))]
     held = len(regular) == len(decisive)
     if held:
-        # The rows of a log that repeats values: what counts is where they change.
+        # A log that repeats values: only the rows with a change are relevant.
         step_s = float(np.median(np.diff(series[decisive[0]][0])))
         series = {s: _changes(*one) for s, one in series.items()}
     elif regular and len(decisive) - len(regular) < _LEAST_SIGNALS:
@@ -152,13 +152,13 @@ def _is_regular(gap_s: FloatArray) -> bool:
 
 
 def _changes(time_s: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the values that differ from the one before."""
+    """Return the values that differ from the previous one."""
     new = np.append(True, value[1:] != value[:-1])
     return time_s[new], value[new]
 
 
 def _longest(gap_s: FloatArray) -> float:
-    """Return the longest regular gap: where many end together, or what nearly all stay below."""
+    """Return the longest regular gap: a length of many gaps, else a limit of nearly all."""
     gap = np.sort(gap_s)
     below, far_below = (np.searchsorted(gap, gap / _EDGE_WIDTH**k, side='left') for k in (1, 2))
     here, before = np.arange(len(gap)) + 1 - below, below - far_below
@@ -166,12 +166,12 @@ def _longest(gap_s: FloatArray) -> float:
     edges = np.flatnonzero(many & (here >= _EDGE_RISE * before) & (gap > 3.0 * np.median(gap)))
     if not len(edges):
         return float(np.quantile(gap, _NEARLY_ALL))
-    # The one that covers most time.
+    # Choose the length that covers most time.
     return float(gap[edges[np.argmax((here * gap)[edges])]])
 
 
 def _updates(gap_s: FloatArray, value: FloatArray, longest_s: float, held: bool) -> Updates | None:
-    """Return how a signal is kept, None if it is not kept by exception."""
+    """Return how a signal is stored, None if it is not stored by exception."""
     if len(gap_s) < _LEAST_VALUES or _is_regular(gap_s):
         return None
     change = np.abs(np.diff(value))[gap_s < _YOUNG * longest_s]
@@ -187,10 +187,10 @@ def _updates(gap_s: FloatArray, value: FloatArray, longest_s: float, held: bool)
 
 
 def held_readings(readings: Readings, compression: Compression) -> Readings:
-    """Return a compressed log as rows in which each value stands until the next one.
+    """Return a compressed log as rows in which each value is repeated until the next one.
 
-    A value stands for the longest regular interval and a tenth more; rows without one are left
-    out. A value that the sender calls bad ends the one before it; NaN means no new value.
+    A value is valid for 1.1 times the longest regular interval; rows without a value are left
+    out. A value marked as bad by the sender ends the previous one; NaN means no new value.
     """
     step_ns = round(compression.step_s * NS_PER_S)
     longest_ns = round(_LATE * compression.longest_s * NS_PER_S)

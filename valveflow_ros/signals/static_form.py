@@ -1,11 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How static power depends on opening and pressure: P = p^e F(V p^q) + c.
+"""The static power as a function of opening and pressure: P = p^e F(V p^q) + c.
 
-The paper has e = c = 0 and q = m (Eq. 1): the knees stand at fixed integrated input u = V p^m.
-A choked valve passes flow in proportion to p^m times an area that depends on the opening alone
-(e = m, q = 0): the knees stand at fixed openings, and c is the power without flow, which the
-paper's F contains.
+The paper has e = c = 0 and q = m (Eq. 1): the breakpoints are at fixed integrated input u = V p^m.
+The flow of a choked valve is p^m times an area that depends on the opening only (e = m, q = 0):
+the breakpoints are at fixed openings, and c is the power without flow, which the paper's F
+contains.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ INTEGRATED_INPUT = 'integrated_input'
 OPENING = 'opening'
 AXES = (INTEGRATED_INPUT, OPENING)
 PAPER_EXPONENT = 1.125
-# Exponents that data may ask for: 1 is ideal choked flow, 9/8 the paper's. With an exponent beyond
-# them one form imitates the other.
+# Allowed range of fitted exponents: 1 is ideal choked flow, 9/8 the paper's. Outside this range
+# one form imitates the other.
 EXPONENTS = 0.9, 1.25
 
 
 @dataclass(frozen=True, slots=True)
 class StaticForm:
-    """What the curve is a function of, and what it is multiplied by.
+    """The argument and the factor of the curve.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class StaticForm:
 
     @property
     def scaled(self) -> bool:
-        """Return whether the curve is multiplied by p^m."""
+        """Return True if the curve is multiplied by p^m."""
         return self.axis == OPENING
 
     @property
@@ -57,7 +57,7 @@ class StaticForm:
         return self.exponent if self.scaled else 0.0
 
     def scale(self, pressure_mpa: FloatArray | float) -> FloatArray | float:
-        """Return p^e; 1 for a form without."""
+        """Return p^e; 1 for a form without p^e."""
         return pressure_mpa**self.exponent if self.scaled else 1.0
 
     def of_rows(
@@ -65,7 +65,7 @@ class StaticForm:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return u and p^e of rows, (n,) each; None for a form without p^e.
 
-        NaN where an input is NaN or the pressure is not positive.
+        NaN if an input is NaN or the pressure is not positive.
         """
         if not self.scaled:
             return integrated_input(opening_percent, pressure_mpa, self.exponent), None
@@ -77,9 +77,9 @@ class StaticForm:
     def of_integrated_input(
         self, u: FloatArray, opening_percent: FloatArray, exponent: float
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Do the same from V p^``exponent`` and the opening, of which the pressure is told.
+        """Return u and p^e from V p^``exponent`` and the opening, which determine the pressure.
 
-        NaN where the opening is not positive and the form needs the pressure.
+        NaN if the opening is not positive and the form needs the pressure.
         """
         if self == StaticForm(INTEGRATED_INPUT, exponent):
             return u, None
@@ -87,13 +87,13 @@ class StaticForm:
 
     @property
     def words(self) -> str:
-        """Return the form as a person writes it."""
+        """Return the form as a formula."""
         m = f'{self.exponent:.4g}'
         return f'p^{m} F(V) + c' if self.scaled else f'F(V p^{m})'
 
 
 def pressure_of(u: FloatArray, opening_percent: FloatArray, exponent: float) -> FloatArray:
-    """Return the pressure in u = V p^``exponent``, MPa; NaN where V is not positive."""
+    """Return the pressure in u = V p^``exponent``, MPa; NaN if V is not positive."""
     pressure = np.empty(len(u))
     _pressure_of(
         np.ascontiguousarray(u, dtype=np.float64),
@@ -104,7 +104,7 @@ def pressure_of(u: FloatArray, opening_percent: FloatArray, exponent: float) -> 
 
 @jit
 def _pressure_of(u: FloatArray, opening: FloatArray, power: float, out: FloatArray) -> None:
-    """Write the pressure row by row; a loop, so that blocks of any size round alike."""
+    """Write the pressure row by row; a loop gives the same rounding for any block size."""
     for t in range(u.size):
         known = opening[t] > 0.0 and u[t] > 0.0
         out[t] = (u[t] / opening[t]) ** power if known else np.nan
@@ -115,7 +115,7 @@ def integrated_input(
 ) -> FloatArray:
     """Return u = V p^m, eq. (1) of the paper with m = 9/8, in % MPa^m.
 
-    NaN where an input is NaN or the pressure is not positive.
+    NaN if an input is NaN or the pressure is not positive.
     """
     opening = np.ascontiguousarray(opening_percent, dtype=np.float64)
     pressure = np.ascontiguousarray(pressure_mpa, dtype=np.float64)
@@ -128,6 +128,6 @@ def integrated_input(
 def _integrated_input(
     opening: FloatArray, pressure: FloatArray, exponent: float, out: FloatArray
 ) -> None:
-    """Write u row by row; a loop, so that blocks of any size round alike."""
+    """Write u row by row; a loop gives the same rounding for any block size."""
     for t in range(opening.size):
         out[t] = opening[t] * pressure[t] ** exponent if pressure[t] > 0.0 else np.nan

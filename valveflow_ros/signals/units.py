@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Units at the border: what a gateway or a historian may send, and what the engine works in."""
+"""Units of a gateway or a historian, and their conversion to the engine's units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Unit:
 
 _PSI_PA = 6894.757293168361  # NIST SP 811, table B.8
 _KGF_CM2_PA = 98066.5  # NIST SP 811, table B.8
-# What is added to a gauge pressure: the standard atmosphere (ISO 2533), at the level of the sea.
+# Added to a gauge pressure: the standard atmosphere at sea level (ISO 2533).
 AIR_MPA = 0.101325
 
 _OPENING = {'%': Unit(1.0), 'percent': Unit(1.0), 'fraction': Unit(100.0)}
@@ -49,8 +49,8 @@ UNITS: dict[Signal, dict[str, Unit]] = {
     Signal.VALVE_COMMAND: _OPENING,
 }
 
-# Understood where a person or a file names them, and never guessed: nothing in the values tells
-# whether a pressure is gauge or absolute.
+# Accepted if a user or a file names them, but never guessed: the values do not show if a
+# pressure is gauge or absolute.
 FURTHER: dict[Signal, dict[str, Unit]] = {
     Signal.MAIN_STEAM_PRESSURE: {
         'barg': Unit(0.1, AIR_MPA),
@@ -64,8 +64,8 @@ FURTHER: dict[Signal, dict[str, Unit]] = {
 }
 
 FURTHER[Signal.GENERATED_POWER] |= dict.fromkeys(FLOW_UNITS, Unit(1.0))
-# The pressure difference over the valve in place of the pressure before it, as instrument makers
-# spell it ('psid').
+# The pressure difference across the valve instead of the pressure before it, in the notation of
+# instrument makers ('psid').
 DIFFERENCES = {f'{name}d': unit for name, unit in _PRESSURE.items()} | {'mbard': Unit(1e-4)}
 FURTHER[Signal.MAIN_STEAM_PRESSURE] |= DIFFERENCES
 
@@ -73,7 +73,7 @@ FURTHER[Signal.MAIN_STEAM_PRESSURE] |= DIFFERENCES
 def engine_unit(signal: Signal, name: str) -> str:
     """Return the unit of values after `convert` from the unit ``name``.
 
-    That of the contract, but for flows, which keep theirs, and pressure differences (MPad).
+    The default unit, except that flows keep their unit, and pressure differences are in MPad.
     """
     if signal == Signal.GENERATED_POWER and name in FLOW_UNITS:
         return name
@@ -82,8 +82,8 @@ def engine_unit(signal: Signal, name: str) -> str:
     return SIGNALS[signal].unit
 
 
-# Not within names: those of files ('power.csv'), keys ("power": ...), and columns, which sentences
-# put between quotes or behind an equals sign.
+# Do not replace inside names of files ('power.csv'), keys ("power": ...), and columns, which are
+# in quotes or after an equals sign.
 _OUTPUT_WORDS = re.compile(
     r"""(?<![\w.\\=:'-])(?:MW(?P<more>²|\\u00b2|\^2|/)?"""
     r"""|(?P<made>[Gg]enerated )?(?<!/)(?P<power>[Pp]owers?))(?!\w|[.=:-]\w|"\s*:)"""
@@ -93,8 +93,8 @@ _OUTPUT_WORDS = re.compile(
 def in_unit(text: str, unit: str) -> str:
     """Return a sentence or page about power in MW as one about a flow in ``unit``.
 
-    Keys and names of files and columns (``rmse_mw``, ``generated_power``) stay as they are, and
-    with a unit that is no flow's the whole text does.
+    Keys and names of files and columns (``rmse_mw``, ``generated_power``) are not changed. If
+    ``unit`` is not a unit of flow, the text is returned unchanged.
     """
     if unit not in FLOW_UNITS:
         return text
@@ -116,18 +116,18 @@ def known_units(signal: Signal) -> dict[str, Unit]:
 
 
 def air_in(signal: Signal, name: str) -> float:
-    """Return what is added to a gauge pressure, in the unit it is in; 0 for any other unit."""
+    """Return the air pressure to add to a gauge pressure, in its unit; 0 for other units."""
     unit = unit_of(signal, name)
     return unit.offset / unit.scale if unit.offset == AIR_MPA else 0.0
 
 
 def unit_of(signal: Signal, name: str) -> Unit:
-    """Look a unit up by its name; capitals do not matter.
+    """Return a unit by its name, which is not case-sensitive.
 
     Raises
     ------
     InputError
-        The unit is not one this signal can have; the sentence lists those it can.
+        The unit is not valid for this signal; the message lists the valid units.
     """
     for spelling, unit in known_units(signal).items():
         if spelling.lower() == name.strip().lower():

@@ -1,3 +1,3 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Many units and months on Dask."""
+"""Processing of many units and months with Dask."""

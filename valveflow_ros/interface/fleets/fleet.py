@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``fleet``: many units and months identified, diagnosed and monitored on Dask."""
+"""``fleet``: identify, diagnose and monitor many units and months with Dask."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ _WAIT_S, _SHOWN = 10, 4
 
 @contextmanager
 def connected(scheduler: str) -> Iterator[Any]:
-    """Give a client of a scheduler, or of a cluster of this machine's cores.
+    """Yield a client of a scheduler, or of a local cluster with one worker per core.
 
     Raises
     ------
     InputError
-        The extra is not installed.
+        The optional dependency is not installed.
     RecordingError, UsageError
-        There is no scheduler at the address, or it is none.
+        No scheduler answers at the address, or the address is invalid.
     """
     import dask
     from distributed import Client, LocalCluster
 
-    # What workers do is told by rows; the library's own words, and its tracebacks, are not.
+    # The rows report the work; messages and tracebacks of the library are suppressed.
     quiet = {'logging': {'distributed': 'critical', 'bokeh': 'critical'}}
     with dask.config.set(quiet), _silenced():
         if scheduler:
@@ -73,21 +73,21 @@ def connected(scheduler: str) -> Iterator[Any]:
             with client:
                 yield client
             return
-        # One thread a worker, also of compiled loops: the workers are the parallel part.
+        # One thread per worker, also in compiled loops: the workers already use all cores.
         cores = len(os.sched_getaffinity(0))
         with LocalCluster(
             n_workers=cores, threads_per_worker=1, processes=True,
             dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL,
             env={'NUMBA_NUM_THREADS': '1'},
         ) as cluster, Client(cluster, set_as_default=False) as client:  # fmt: skip
-            # A worker that is killed while it starts is given up by its nanny: others take over.
+            # Dask does not restart a worker killed during its start; `adapt` starts another.
             cluster.adapt(minimum=cores, maximum=cores, interval='1s')
             yield client
 
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """Let the loggers of the library, of which some have levels of their own, say nothing."""
+    """Silence all loggers of the library; some of them have their own levels."""
     names = [n for n in logging.root.manager.loggerDict if n.partition('.')[0] == 'distributed']
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:
@@ -100,7 +100,7 @@ def _silenced() -> Iterator[None]:
 
 
 def workers_words(client: Any) -> str:
-    """Say how many workers there are and what memory each is bounded to."""
+    """Return a sentence with the number of workers and the memory limit of each."""
     workers = client.scheduler_info(n_workers=-1)['workers'].values()
     if not workers:
         return f'{client.scheduler.address} has no worker yet; waiting for one.'
@@ -112,7 +112,7 @@ def workers_words(client: Any) -> str:
 
 
 def _threads(client: Any) -> int:
-    """Return how many tasks the workers do at once."""
+    """Return the number of tasks that the workers run in parallel."""
     workers = client.scheduler_info(n_workers=-1)['workers'].values()
     return sum(w['nthreads'] for w in workers)
 
@@ -123,22 +123,22 @@ Chain = Generator[FleetTask, Row, None]
 def spread(
     client: Any, work: Callable[[FleetTask], Row], chains: Sequence[Chain]
 ) -> Iterator[tuple[FleetTask, Row]]:
-    """Do chains of tasks on the workers; yield each task with its row as it is done.
+    """Run chains of tasks on the workers; yield each task with its row when it is done.
 
     Parameters
     ----------
     client : distributed.Client
     work : callable
-        Done on a worker.
+        Function that a worker calls with a task.
     chains : sequence of generator
-        Each yields a task and is sent its row. A chain has one task on the cluster at a time: the
-        scheduler never knows of more tasks than there are units, and nothing that is done is lost
-        with a worker. Chains that are further on come first, so that units end one after another.
+        Each yields a task and receives its row by `send`. Each chain has at most one task on the
+        cluster: the scheduler has at most one task per unit, and finished work is not lost with
+        a worker. Chains with more finished tasks come first, so that units end one by one.
 
     Raises
     ------
     ValveflowError
-        The scheduler has gone.
+        The connection to the scheduler is lost.
     """
     from distributed import as_completed
 
@@ -172,13 +172,13 @@ def _outcome(future: Any, task: FleetTask) -> Row:
         raise ValveflowError(
             'The scheduler has gone. What is done stays: run the same command again.'
         ) from None
-    except Exception as error:  # noqa: BLE001 - whatever keeps a worker from beginning
+    except Exception as error:  # noqa: BLE001 - anything that prevents a worker from starting
         about = ' '.join(f'{type(error).__name__}: {error}'.split())[:200]
         return failed_row(task, f'The worker could not do it ({about}).')
 
 
 def _chain(logs: Sequence[UnitLog], folder: Path) -> Chain:
-    """Yield the tasks of a unit: the curve of a log is the reference of the next."""
+    """Yield the tasks of a unit; the curve of a log is the reference for the next log."""
     before = first = ''
     for log in logs:
         row = yield FleetTask(log, folder, before, first)
@@ -186,11 +186,8 @@ def _chain(logs: Sequence[UnitLog], folder: Path) -> Chain:
         first = first or before
 
 
-# The results.
-
-
 def _schema() -> Any:
-    """Return the columns of the data set; times are UTC, powers MW or what `output_unit` says."""
+    """Return the columns of the data set; times are UTC, powers are in MW or in `output_unit`."""
     import pyarrow as pa
 
     f, s, n, b = pa.float64(), pa.string(), pa.int64(), pa.bool_()
@@ -252,7 +249,7 @@ def partition_of(folder: Path, unit: str) -> Path:
 
 
 def _write_unit(folder: Path, unit: str, rows: Sequence[Row]) -> UnitStory:
-    """Write the data and the page of a unit whose logs are all done."""
+    """Write the data and the page of a unit after all its logs are processed."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -266,16 +263,17 @@ def _write_unit(folder: Path, unit: str, rows: Sequence[Row]) -> UnitStory:
 
 @dataclass(frozen=True, slots=True)
 class FleetResult:
-    """What a run over a fleet came to.
+    """The result of a run over a fleet.
 
     Attributes
     ----------
     folder : Path
-        Holds ``fleet.parquet``, ``fleet.html`` and ``units``.
+        Contains ``fleet.parquet``, ``fleet.html`` and ``units``.
     stories : tuple of UnitStory
-        What the page tells of each unit, in order of their names.
+        The content of the page for each unit, sorted by name.
     anew, unchanged, failed : int
-        Tasks done now, found done and unchanged, and those without any result.
+        Number of tasks done in this run, of tasks done before and unchanged, and of tasks
+        without any result.
     """
 
     folder: Path
@@ -295,7 +293,7 @@ class FleetResult:
         }
 
     def to_dataframe(self) -> Any:
-        """Return the data set as a pandas.DataFrame, one row a log."""
+        """Return the data set as a pandas.DataFrame, one row per log."""
         import pyarrow as pa
         import pyarrow.dataset as ds
 
@@ -304,7 +302,7 @@ class FleetResult:
 
 
 def check_installed() -> None:
-    """Raise `InputError` where what a fleet needs is not installed."""
+    """Raise `InputError` if a package that `fleet` needs is not installed."""
     plotly_script()
     missing = [n for n in ('dask', 'distributed', 'pyarrow') if find_spec(n) is None]
     if missing:
@@ -325,31 +323,31 @@ def fleet(
 ) -> FleetResult:
     """Identify, diagnose and monitor the logs of many units, in parallel.
 
-    Each log is a task: what `identify`, `diagnose` and `monitor` give for it is written into
-    ``folder/units/UNIT/LOG``, and the curve of a log is the reference of the next one of its unit.
-    What an earlier run has done, and what has not changed since, is not done again.
+    Each log is a task: the results of `identify`, `diagnose` and `monitor` are written into
+    ``folder/units/UNIT/LOG``. The curve of a log is the reference for the next log of its unit.
+    Tasks that an earlier run has done and whose inputs have not changed are not repeated.
 
     Parameters
     ----------
     logs : sequence of str or Path
         Logs, folders, globs or manifests; see `read_fleet`.
     folder : str or Path
-        Made if absent. It gets ``fleet.parquet`` and ``fleet.html``, of these logs alone.
+        Created if absent. Its ``fleet.parquet`` and ``fleet.html`` cover these logs only.
     scheduler : str
-        Address of a Dask scheduler whose workers see logs and folder under the same names; a
-        cluster of this machine's cores without it.
+        Address of a Dask scheduler whose workers see logs and folder under the same names;
+        by default a local cluster with one worker per core.
     options : sequence of str
-        How logs are read and judged; see `read_options`.
+        How logs are read and evaluated; see `read_options`.
     progress : Progress
 
     Raises
     ------
     InputError, UsageError
-        The extra is not installed, an option is wrong, or two units have one name.
+        The optional dependency is missing, an option is wrong, or two units have the same name.
     RecordingError
-        A log is not there, the folder cannot be written, or no scheduler answers.
+        A log does not exist, the folder cannot be written, or no scheduler answers.
     ValveflowError
-        The scheduler has gone meanwhile.
+        The connection to the scheduler was lost.
     """
     check_installed()
     folder = Path(folder).absolute()
@@ -361,7 +359,7 @@ def fleet(
     anew = failed = 0
     with connected(scheduler) as client:
         progress.say(workers_words(client))
-        # The first of them, in the order in which the scheduler hands them out.
+        # The first tasks, in the order in which the scheduler distributes them.
         first = [f'{unit} {logs[0].name}' for unit, logs in units.items()][: _threads(client)]
         if first:
             progress.say(

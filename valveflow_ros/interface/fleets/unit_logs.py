@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The logs of a fleet: folders, globs and manifests become units with their logs in order."""
+"""The logs of a fleet: read folders, globs and manifests into units with sorted logs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MANIFEST = {'unit', 'log', 'options'}
 _PAIRED = ('--column', '--constant', '--set')
 _TABLE = ('--time-zone', '--date-order', '--decimal', '--sheet', '--max-unpacked', '--period')
 _NO_DIAGNOSIS = '--no-diagnosis'
-# The reference of a log is the curve before it, and a model would have to be hashed.
+# Not allowed: the reference is the previous log's curve, and `key_of` does not hash a model.
 _FILES = ('model_file', 'reference_file')
 _LONGEST_HEAD = 1 << 16
 _SPLIT = re.compile(r'_\d+\.(mcap|db3)(\.zstd)?$')
@@ -34,17 +34,17 @@ _SPLIT = re.compile(r'_\d+\.(mcap|db3)(\.zstd)?$')
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a log is read and judged.
+    """How a log is read and evaluated.
 
     Attributes
     ----------
     mapping : LogMapping
     parameters : dict
-        Of the monitor, by name.
+        Parameters of the monitor by name.
     diagnosis : bool
-        The monitor's own diagnoses are computed.
+        True if the monitor's own diagnoses are computed.
     text : str
-        All of it, for the hash.
+        All options as text, for the hash.
     """
 
     mapping: LogMapping
@@ -61,9 +61,9 @@ class UnitLog:
     ----------
     unit : str
     name : str
-        Of the log, without its suffix.
+        Name of the log, without its suffix.
     log : Path
-        Absolute.
+        Absolute path.
     options : Options
     """
 
@@ -74,13 +74,13 @@ class UnitLog:
 
 
 def read_options(words: Sequence[str]) -> Options:
-    """Read options as the verbs take them; of two about one thing the later one counts.
+    """Read options in the form of the verbs; a later option overrides an earlier equal one.
 
     Parameters
     ----------
     words : sequence of str
-        ``--column``, ``--constant``, ``--set``, ``--params``, those of a table, each with its
-        value behind it, and ``--no-diagnosis``.
+        ``--column``, ``--constant``, ``--set``, ``--params`` and the options of a table, each
+        followed by its value, and ``--no-diagnosis``.
 
     Raises
     ------
@@ -124,23 +124,23 @@ def read_options(words: Sequence[str]) -> Options:
 def read_fleet(
     sources: Sequence[str | Path], options: Sequence[str] = (), output: Path | None = None
 ) -> dict[str, list[UnitLog]]:
-    """Return the logs of each unit in order of time.
+    """Return the logs of each unit in chronological order.
 
     Parameters
     ----------
     sources : sequence of str or Path
-        Logs, folders and globs, whose units are the folders that the logs stand in, sorted by
-        name; or manifests, CSV files with the columns ``unit``, ``log`` and, if wanted,
-        ``options``. A log in one is a log, folder or glob seen from the manifest.
+        Logs, folders and globs; the folder of a log is the name of its unit, and logs are sorted
+        by name. Or manifests, CSV files with the columns ``unit``, ``log`` and optionally
+        ``options``; ``log`` is a log, folder or glob relative to the manifest.
     options : sequence of str
-        Of all logs; see `read_options`. What a manifest says of one log counts for more.
+        Options of all logs; see `read_options`. Options in a manifest override them.
     output : Path, optional
-        The folder of results, in which no logs are looked for.
+        The folder of results; logs in it are ignored.
 
     Raises
     ------
     RecordingError, InputError
-        A log is not there, a manifest cannot be read, or two units have one name.
+        A log does not exist, a manifest cannot be read, or two units have the same name.
     """
     found: dict[str, list[UnitLog]] = {}
     origin: dict[str, tuple[str, object]] = {}
@@ -191,14 +191,14 @@ def read_fleet(
 
 
 def _unit_name(name: str) -> str:
-    """Return a unit's name if a folder can have it; raises `InputError`."""
+    """Return a unit's name; raise `InputError` if it cannot be the name of a folder."""
     if not name or name != name.strip(' .') or '/' in name or not name.isprintable():
         raise InputError(f"'{name}' cannot be the name of a unit: its folder is called so.")
     return name
 
 
 def _manifest(path: Path) -> list[tuple[int, dict[str, str]]] | None:
-    """Return the rows of a manifest with their line numbers; None if the file is none."""
+    """Return the rows of a manifest with their line numbers; None if it is no manifest."""
     if path.suffix.lower() != '.csv' or not path.is_file():
         return None
     try:
@@ -227,7 +227,7 @@ def _manifest(path: Path) -> list[tuple[int, dict[str, str]]] | None:
 
 
 def _logs_at(place: Path, skipped: Path | None) -> list[Path]:
-    """Return the logs that a name stands for: itself, those in a folder, or those of a glob."""
+    """Return the logs for a name: the log itself, those in a folder, or those of a glob."""
     if place.is_dir() and not _is_bag(place):
         found = []
         for entry in sorted(place.iterdir(), key=_in_order):
@@ -249,9 +249,9 @@ def _logs_at(place: Path, skipped: Path | None) -> list[Path]:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Tell whether a folder is one recording in splits, and not a folder of recordings.
+    """Return True if a folder is one split recording, and not a folder of recordings.
 
-    `simulate` and `import` leave a `metadata.yaml` beside each single file too.
+    A `metadata.yaml` is not enough: `simulate` and `import` write one for single files too.
     """
     path = folder / 'metadata.yaml'
     if not path.is_file():
@@ -260,13 +260,13 @@ def _is_bag(folder: Path) -> bool:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
         named = {str(n) for n in content['rosbag2_bagfile_information']['relative_file_paths']}
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
-        return True  # the reader says what is wrong with it
+        return True  # the reader reports the error later
     logs = {p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES}
     return not (logs - named) and all(_SPLIT.search(name) for name in named)
 
 
 def _in_order(path: Path) -> list[list[Any]]:
-    """Return what sorts paths as people do: 2026-2 comes before 2026-10."""
+    """Return a sort key that compares numbers by value: 2026-2 comes before 2026-10."""
     return [
         [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', name)]
         for name in path.parts

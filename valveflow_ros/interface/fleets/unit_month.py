@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One task of a fleet: a log of a unit identified, diagnosed and monitored, once."""
+"""One task of a fleet: identify, diagnose and monitor one log of a unit."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class FleetTask:
-    """What a worker is given.
+    """The task that a worker receives.
 
     Attributes
     ----------
     of : UnitLog
     folder : Path
-        DIR, which all workers must see.
+        The folder of results, which all workers must see.
     before, first : str
-        The curve of the log before it, and the first one of the unit: names of files in
-        ``folder``, empty if there is none.
+        File names in ``folder`` of the previous log's curve and of the unit's first curve,
+        empty if there is none.
     version : str
-        Of the package that asks.
+        Version of the package that created the task.
     """
 
     of: UnitLog
@@ -68,17 +68,17 @@ class FleetTask:
 
     @property
     def place(self) -> Path:
-        """Return the folder of its results."""
+        """Return the folder of the task's results."""
         return self.folder / UNITS / self.of.unit / self.of.name
 
 
 def unit_month(task: FleetTask) -> Row:
-    """Do one task on a worker, unless it is done and unchanged; return its row.
+    """Do one task on a worker, unless it was done before and is unchanged; return its row.
 
-    The folder of the task gets what the single verbs write, in ``identify``, ``diagnose`` and
-    ``monitor``. The row is kept beside them last, with the hash of all that it follows from.
-    Nothing is raised: what went wrong is the row's sentence. What may go better the next time (a
-    full disk, no memory) is not kept.
+    The verbs write into ``identify``, ``diagnose`` and ``monitor`` in the folder of the task.
+    The row is written last, with the hash of all its inputs. No exception is raised: an error
+    becomes a sentence of the row. The row is not kept after an error that may be temporary
+    (full disk, no memory).
     """
     begun = time.perf_counter()
     try:
@@ -103,20 +103,20 @@ def unit_month(task: FleetTask) -> Row:
         row['task_s'] = time.perf_counter() - begun
         text = json.dumps(_finite({'key': key, 'row': row}), allow_nan=False)
         write_texts(task.place, {_ROW: text + '\n'})
-        # As it comes back the next time.
+        # Return the same types as a row that was read from its file.
         return {**json.loads(text)['row'], 'anew': True}
     except ValveflowError as error:
         sentence = str(error)
     except MemoryError:
         sentence = 'There is not enough memory for this log on the worker.'
-    except Exception as error:  # noqa: BLE001 - one log must not end the others
+    except Exception as error:  # noqa: BLE001 - one log must not stop the others
         about = ' '.join(f'{type(error).__name__}: {error}'.split())[:200]
         sentence = f'This should not have happened ({about}); please report it.'
     return failed_row(task, sentence)
 
 
 def failed_row(task: FleetTask, sentence: str) -> Row:
-    """Return the row of a task that could not be done, and is tried again the next time."""
+    """Return the row of a failed task; the next run tries the task again."""
     return {**_base(task), 'status': 'failed', 'sentences': [sentence], 'anew': True}
 
 
@@ -133,7 +133,7 @@ def _base(task: FleetTask) -> Row:
 
 
 def key_of(task: FleetTask) -> str:
-    """Return the hash of all that a task's results follow from."""
+    """Return the hash of all inputs of a task."""
     found = hashlib.sha256(f'{__version__}\n{task.of.options.text}\n'.encode())
     curves = [task.folder / c for c in (task.before, task.first) if c]
     log = task.of.log
@@ -141,7 +141,7 @@ def key_of(task: FleetTask) -> str:
     for path in [*curves, *inside]:
         try:
             with path.open('rb') as file:
-                # Lengths between the parts: no two sets of files give the same bytes.
+                # The lengths ensure that two different sets of files never give the same bytes.
                 found.update(f'{path.name} {os.fstat(file.fileno()).st_size}\n'.encode())
                 while block := file.read(_BLOCK):
                     found.update(block)
@@ -151,7 +151,7 @@ def key_of(task: FleetTask) -> str:
 
 
 def _kept(path: Path, key: str) -> Row | None:
-    """Return the row of an earlier run, if it follows from the same."""
+    """Return the row of an earlier run if its inputs were the same."""
     try:
         content = json.loads(path.read_text(encoding='utf-8'))
         return dict(content['row']) if content['key'] == key else None
@@ -171,7 +171,7 @@ def _judged(task: FleetTask) -> Row:
         return {**row, 'status': 'failed', 'sentences': [str(error)]}
     row['read_s'] = time.perf_counter() - begun
     given, zone = of.options.parameters, of.options.mapping.table.time_zone
-    # Without dynamics every ramp would look like a fault.
+    # With a curve without dynamics every ramp would look like a fault.
     model = before if before is not None and before.dynamics else None
     verbs: dict[str, tuple[Callable[[], Any], Callable[[Any], Row]]] = {
         'identify': (
@@ -201,9 +201,9 @@ def _judged(task: FleetTask) -> Row:
 
 
 def _check_order(log: Log, before: Characteristic | None, name: str) -> None:
-    """Refuse a log that begins before the end of the one whose curve is its reference.
+    """Raise `DataError` if a log begins before the end of the log of its reference curve.
 
-    The last row of one may be the first row of the next.
+    The last row of a log may be the first row of the next.
     """
     if before is None or not len(log.readings):
         return
@@ -280,7 +280,7 @@ def _shift_facts(name: str, shift: Shift | None, unit: str) -> Row:
 
 
 def _mean_difference(first: Characteristic, now: Characteristic) -> float:
-    """Return how much more the curve gives than the first one, in MW, over what both know."""
+    """Return the mean of this curve minus the first curve in MW, over their common range."""
     pressure = first.shown_at_mpa
     a, b = first.at_pressure(pressure), now.at_pressure(pressure)
     low, high = max(a.breakpoints[0], b.breakpoints[0]), min(a.breakpoints[-1], b.breakpoints[-1])
@@ -309,7 +309,7 @@ def _diagnosis_facts(found: DiagnosisResult) -> Row:
 
 
 def _onset(parameters: Iterable[Mapping[str, Any]]) -> Row:
-    """Return when a cause set in, and the interval, in ns; None for one without a date."""
+    """Return the onset of a cause and its interval in ns; None for a cause without a date."""
     dated = next((p for p in parameters if 'origin_ns' in p), {})
 
     def time_ns(days: float | None) -> int | None:
@@ -331,7 +331,7 @@ def _monitor_facts(found: MonitorResult) -> Row:
 
 
 def _finite(value: Any) -> Any:
-    """Replace what JSON does not know."""
+    """Replace values that JSON cannot represent: NumPy scalars, NaN and infinity."""
     if isinstance(value, Mapping):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, list):

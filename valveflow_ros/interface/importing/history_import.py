@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Read a historian directly, part by part, into a log; one that was stopped goes on."""
+"""Read a historian directly, part by part, into a log; a stopped import can be continued."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from valveflow_ros.interface.files import reason
 from valveflow_ros.logs.mcap.importing import WrittenLog, write_readings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
 
-# Parts of this length are read at once; what is stopped reads no more than one again.
+# Length of a part; after a stop at most one part is read again.
 _PART_NS = 4 * 3600 * NS_PER_S
 _SUFFIX = '.parts'
 
 
 class HistorySource(Protocol):
-    """Where history comes from; a further historian needs no more than this.
+    """A source of history; support for a new historian only needs these members.
 
     Attributes
     ----------
     name : str
-        What it is called in sentences and in the log: an address without a password.
+        Its name in messages and in the log: an address without a password.
     columns : mapping of Signal to str
-        The signals that it has, and what they are called there, with the unit: an import that was
-        stopped goes on only where neither has changed.
+        The available signals with their name and unit in the historian. A stopped import is
+        continued only if ``name`` and ``columns`` have not changed.
     """
 
     @property
     def name(self) -> str:
-        """Return what it is called."""
+        """Return its name in messages."""
 
     @property
     def columns(self) -> Mapping[Signal, str]:
-        """Return what the signals are called there."""
+        """Return the names of the signals in the historian."""
 
     def read(self, start_ns: int, end_ns: int) -> list[Readings]:
-        """Return the readings of ``[start_ns, end_ns)``, in the order of time, engine units.
+        """Return the readings of ``[start_ns, end_ns)`` in chronological order, in engine units.
 
         Raises
         ------
         DataError
-            It cannot be reached, or has no such signal or no history.
+            The historian cannot be reached, or has no such signal or no history.
         """
 
 
@@ -65,23 +65,23 @@ def import_history(
 ) -> WrittenLog:
     """Read a period of history and write it as a recording.
 
-    What is read waits in a folder beside the recording, ``NAME.parts``. The same call goes on
-    where an earlier one was stopped.
+    The parts are kept in the folder ``NAME.parts`` beside the recording. The same call
+    continues an import that was stopped.
 
     Parameters
     ----------
     source : HistorySource
     start_ns, end_ns : int
-        The period, ns since 1970; its end is not included.
+        The period, ns since 1970; the end is excluded.
     path : str or Path
-        As for `write_readings`.
+        The recording, as in `write_readings`.
 
     Raises
     ------
     DataError
-        As `HistorySource.read`; or there is no value in the period.
+        As in `HistorySource.read`; or there is no value in the period.
     RecordingError
-        The recording exists, cannot be written, or the folder is that of another import.
+        The recording exists or cannot be written, or the folder belongs to another import.
     """
     path = Path(path)
     folder = path.with_name(path.name + _SUFFIX)
@@ -108,7 +108,7 @@ def import_history(
         progress(0.9, 'writing')
         units = [{'topic': topic, 'unit': SIGNALS[s].unit} for s, topic in _topics(source)]
         if not any(len(_load(file)) for file in files):
-            shutil.rmtree(folder, ignore_errors=True)  # it may have some later
+            shutil.rmtree(folder, ignore_errors=True)  # a later call may find values
             raise DataError(f'{source.name} has no value in this period.')
         written = write_readings(
             map(_load, files), list(source.columns), path, overwrite=overwrite,
@@ -127,7 +127,7 @@ def _topics(source: HistorySource) -> list[tuple[Signal, str]]:
 
 
 def _save(file: Path, parts: list[Readings]) -> None:
-    """Write a part under its own name once it is whole."""
+    """Write a part and give it its final name when it is complete."""
     part = file.with_suffix('.tmp')
     columns = {
         name: np.concatenate([getattr(p, name) for p in parts])

@@ -1,8 +1,8 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Read a historian's table once, judge it, and give it out in the order of time.
+"""Read a historian's table once, check it, and return its rows in chronological order.
 
-The rows wait on disk meanwhile, so that a table of years needs no more memory than its times.
+The values are stored on disk: a table of years needs memory for its times only.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from valveflow_ros.records import (
 from valveflow_ros.report.data import Gap, gaps
 from valveflow_ros.signals.units import convert, engine_unit
 
-_SAMPLE = 500_000  # so many values are enough to judge a unit by
+_SAMPLE = 500_000  # values that are enough to check a unit
 _ROWS = 200_000  # in memory at a time
 _BY_COLUMN = {info.column: info for info in SIGNALS}
 
 
 @dataclass(frozen=True, slots=True)
 class SignalSource:
-    """Where one signal comes from; ``low`` and ``high`` in the engine's unit.
+    """The column of one signal; ``low`` and ``high`` in the engine's unit.
 
-    ``words`` counts what stands in cells in place of numbers, the most frequent
-    first; ``empty`` counts cells that are empty or say so; ``ground`` says why the
-    column was chosen, where that had to be found out; ``air`` what is added to a gauge
-    pressure.
+    ``words`` counts the texts that are found in place of numbers, the most frequent
+    first; ``empty`` counts the cells without a value; ``ground`` says why the column
+    was chosen, if it was not named; ``air`` describes the air pressure that is added
+    to a gauge pressure.
     """
 
     topic: str
@@ -79,7 +79,7 @@ class SignalSource:
 
 
 class _Statistics:
-    """Range and a sample of a column that passes by in blocks."""
+    """Range and a sample of a column that is read in blocks."""
 
     def __init__(self) -> None:
         self.low = self.high = float('nan')
@@ -88,7 +88,7 @@ class _Statistics:
         self._stride = 1
 
     def add(self, values: FloatArray) -> None:
-        """Count a block, values as they stand in the file."""
+        """Add a block of values in the unit of the file."""
         finite = values[np.isfinite(values)]
         self.missing += len(values) - len(finite)
         if not len(finite):
@@ -101,17 +101,17 @@ class _Statistics:
             self._parts = [np.concatenate(self._parts)[::2].copy()]
 
     def sample(self) -> FloatArray:
-        """Return values that stand for all, the lowest and the highest among them."""
+        """Return representative values, including the lowest and the highest."""
         return np.concatenate([*self._parts, np.array([self.low, self.high])])
 
 
 class Spool:
-    """Columns in unnamed files, which vanish with the process.
+    """Columns in unnamed temporary files, which end with the process.
 
     Parameters
     ----------
     folder : Path
-        Where there is room for them: beside the log that is to be written.
+        A folder with enough space: that of the log to be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -124,11 +124,11 @@ class Spool:
         Raises
         ------
         RecordingError
-            If the disk is full.
+            The disk is full.
         """
         try:
             if name not in self._files:
-                file: IO[bytes] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 - `close` ends it
+                file: IO[bytes] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115
                 self._files[name] = file, values.dtype
             file, dtype = self._files[name]
             file.write(np.ascontiguousarray(values, dtype).data.cast('B'))
@@ -138,45 +138,45 @@ class Spool:
             raise RecordingError(self._folder, problem) from None
 
     def __contains__(self, name: str) -> bool:
-        """Return whether there is such a column."""
+        """Return True if there is such a column."""
         return name in self._files
 
     def take(self, name: str, rows: slice | IntArray) -> NDArray[Any]:
-        """Return some rows of a column: a stretch, or any rows in any order."""
+        """Return rows of a column: a slice, or any indices in any order."""
         file, dtype = self._files[name]
         column: NDArray[Any] = np.memmap(file, dtype, 'r')
         return np.array(column[rows])
 
     def close(self) -> None:
-        """Give the space back."""
+        """Release the disk space."""
         for file, _ in self._files.values():
             file.close()
 
 
 class TableImport:
-    """A table that is read once, judged, and then given out in the order of time.
+    """A table that is read once, checked, and then returned in chronological order.
 
     Parameters
     ----------
     path : Path
         The table.
     mapping : LogMapping
-        What the person said of it.
+        What the user specified about the table.
     progress : Progress
-        Receives what was understood and what looks wrong.
+        Receives the interpretation of the table and the warnings.
     strict : bool
-        Refuse also a column that the person named without its unit, where its values speak
-        against the usual one; otherwise that is a warning.
+        Also refuse a column that the user named without a unit if its values contradict the
+        usual unit; otherwise only warn.
 
     Attributes
     ----------
     rows_read, rows, duplicates : int
-        Rows of the file with a readable time, those used, and those left out
-        for having one that stood there before.
+        Number of rows with a readable time, of rows used, and of rows left out because
+        their time occurred before.
     period_s : float
-        Median step.
+        Median step of time.
     span_ns : tuple of int
-        First and last time.
+        First and last time, ns since 1970.
     gaps : list of Gap
         The longest first.
     ignored : tuple of str
@@ -184,14 +184,14 @@ class TableImport:
     notes : tuple of str
         Sentences of the reader.
     time_zone, time_words : str
-        The zone the times were taken to be in, and how they are written.
+        The assumed time zone, and a description of the format of the times.
     is_long : bool
-        The table has a row for each value.
+        True if the table has one row per value.
 
     Raises
     ------
     RecordingError, InputError, DataError
-        It cannot be read, a column is missing, a unit unknown.
+        The table cannot be read, a column is missing, or a unit is unknown.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class TableImport:
         self._spool: Spool | None = None
         self._statistics = {name: _Statistics() for name in self._used}
         self._time_ns: IntArray = np.empty(0, np.int64)
-        # Rows to be taken, in the order of time; None: all, as they stand.
+        # Rows to use, in chronological order; None: all rows in the order of the file.
         self._order: IntArray | None = None
         unused = (names[n] for n in names if n not in self._used)
         self.ignored = (*self._reader.ignored, *unused)
@@ -237,17 +237,17 @@ class TableImport:
 
     @property
     def signals(self) -> list[Signal]:
-        """Return the signals there will be readings of."""
+        """Return the signals that will have readings."""
         return sorted({*(_BY_COLUMN[name].signal for name in self._used), *self._constants})
 
     def read(self, spool: Spool | None) -> None:
-        """Read the whole table into the spool (or only look at it) and judge it.
+        """Read the whole table and check it; store the values in the spool unless it is a trial.
 
         Raises
         ------
         RecordingError, InputError, DataError
-            As the constructor; or no row is usable, or the values of a column
-            speak against what it was taken for.
+            As in the constructor; or no row is usable, or the values of a column
+            contradict the signal or unit assumed for it.
         """
         reader = self._reader
         times: list[IntArray] = []
@@ -288,14 +288,14 @@ class TableImport:
         self.time_zone, self.time_words = reader.time_zone, reader.time_words
 
     def tables(self) -> Iterator[SampleTable]:
-        """Yield the rows in the order of time, in the engine's units."""
+        """Yield the rows in chronological order, in the engine's units."""
         for time_ns, _, columns, quality in self._blocks():
             for signal, value in self._constants.items():
                 columns[signal] = np.full(len(time_ns), value)
             yield SampleTable.from_columns(time_ns, columns, quality)
 
     def readings(self) -> Iterator[Readings]:
-        """Yield the values one by one in the order of time, in the engine's units."""
+        """Yield the values one by one in chronological order, in the engine's units."""
         if not self.is_long:
             yield from map(table_to_readings, self.tables())
             return
@@ -312,7 +312,7 @@ class TableImport:
             yield with_constants(readings, self._constants)
 
     def sources(self) -> list[SignalSource]:
-        """Return where each signal comes from, in the order of `Signal`."""
+        """Return the source of each signal, in the order of `Signal`."""
         sources = []
         reader = self._reader
         for info in SIGNALS:
@@ -340,7 +340,7 @@ class TableImport:
         return sources
 
     def summary(self) -> dict[str, Any]:
-        """Return everything that was understood, for a program."""
+        """Return the interpretation of the table as plain values."""
         start_ns, end_ns = self.span_ns
         return {
             'source': str(self._reader.path),
@@ -358,7 +358,7 @@ class TableImport:
         }
 
     def as_json(self) -> str:
-        """Return the summary as the text that goes into the log; the file's name only."""
+        """Return the summary as JSON text for the log, with the file's name without its path."""
         content = {**self.summary(), 'source': self._reader.path.name}
         finite = [
             {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in s.items()}
@@ -367,7 +367,7 @@ class TableImport:
         return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
 
     def _sort(self) -> list[str]:
-        """Bring the rows into the order of time; in a long table no time is one too many."""
+        """Sort the rows by time; a long table may repeat a time, another table may not."""
         time_ns, order = self._time_ns, None
         steps = np.diff(time_ns)
         notes = []
@@ -404,7 +404,7 @@ class TableImport:
     ) -> Iterator[
         tuple[IntArray, slice | IntArray, dict[Signal, FloatArray], dict[Signal, ByteArray]]
     ]:
-        """Yield times, places in the file, columns and qualities, block by block."""
+        """Yield times, row numbers in the file, columns and qualities, block by block."""
         spool = self._spool
         assert spool is not None
         for start in range(0, self.rows, _ROWS):
@@ -420,7 +420,7 @@ class TableImport:
             yield self._time_ns[rows], rows, columns, quality
 
     def _judge(self, refused: list[RefusedError]) -> None:
-        """Refuse what was guessed wrongly, and warn of the rest; raises `RefusedError`."""
+        """Raise `RefusedError` for wrong guesses, and warn of other implausible columns."""
         settings, reader, steam = self._limits, self._reader, self._output == 'MW'
         judged = (
             doubt(_BY_COLUMN[name].signal, found.sample(), self._units[name], settings, steam)
@@ -432,7 +432,7 @@ class TableImport:
         said = {c.name for c in self._mapping.columns.values() if c.unit}
         unsaid = {signal for signal in names if SIGNALS[signal].topic not in said}
         for strict, grounds in ((False, guessed), (True, unsaid)):
-            # Who has to come back for one thing is told of the others too.
+            # If anything is refused, report all other problems in the same message.
             if strict and not (self._strict or refused):
                 break
             try:
@@ -440,7 +440,7 @@ class TableImport:
             except RefusedError as error:
                 refused = [one for one in refused if not one.last] + [error]
         if refused:
-            # What was understood until then is of use to who has to correct it.
+            # The interpretation so far helps the user to correct the command.
             for sentence in reader.understood():
                 self._progress.say(sentence)
             raise merge_refusals(reader.path, refused)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The effects a plant can have, by family; every `Effect` at the top of a module here is one."""
+"""The effects of a plant by family: all `Effect` objects at the top level of these modules."""
 
 from __future__ import annotations
 

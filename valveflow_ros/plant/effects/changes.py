@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects that are a change in time: drifts, steps, intervals and the daily swing."""
+"""Effects that are a change in time: drifts, steps, intervals and the daily cycle."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from valveflow_ros.records import FloatArray
 def install_gain_drift(values: Values, hooks: Hooks) -> None:
     """The power per flow drifts.
 
-    Erosion and deposits behind the valve, falling efficiency of the cycle, and a
-    drifting scale of the power transducer are the same to the four signals:
+    Erosion and deposits after the valve, decreasing efficiency of the cycle, and a
+    drifting scale of the power transducer have the same effect on the four signals:
 
         x = F(u) (1 + g t / 10 d),  t from the first row on
     """
@@ -48,10 +48,10 @@ GAIN_DRIFT = Effect(
 
 
 def install_gain_step(values: Values, hooks: Hooks) -> None:
-    """The power per flow changes at once and stays changed.
+    """The power per flow changes suddenly and permanently.
 
-    Maintenance, another power meter, a heater or an extraction taken in or out
-    for good:
+    Possible causes are maintenance, another power meter, and a heater or an
+    extraction that is permanently switched on or off:
 
         x = F(u) (1 + g),  t >= t0
     """
@@ -72,10 +72,10 @@ GAIN_STEP = Effect(
 
 
 def install_input_drift(values: Values, hooks: Hooks) -> None:
-    """The opening or the pressure is read ever more wrongly, or the seat wears.
+    """The error of the opening or of the pressure grows, or the seat wears.
 
     A drifting scale of the pressure transmitter, a drifting scale of the position
-    sensor and a wearing seat all change u against its reading:
+    sensor and a wearing seat all change the ratio of true u to measured u:
 
         u_true = u (1 + g t / 10 d),  t from the first row on
     """
@@ -98,7 +98,7 @@ INPUT_DRIFT = Effect(
 def install_input_step(values: Values, hooks: Hooks) -> None:
     """The pressure or position transmitter is recalibrated.
 
-    From then on the same reading of u stands for another flow area:
+    After that the same measured u corresponds to another flow area:
 
         u_true = u (1 + g),  t >= t0
     """
@@ -121,8 +121,8 @@ INPUT_STEP = Effect(
 def install_output_offset_drift(values: Values, hooks: Hooks) -> None:
     """The zero of the power drifts.
 
-    A drifting zero of the power transducer, or auxiliary load that comes and
-    stays, adds the same at any load:
+    A drifting zero of the power transducer, or a slowly growing auxiliary load,
+    adds the same power at any load:
 
         y = G x + b t / 10 d,  t from the first row on
     """
@@ -146,7 +146,7 @@ _HOUR_S = 3600.0
 
 
 def _draw(values: Values) -> Iterator[tuple[float, float]]:
-    """Yield start and end of one interval after the other, in seconds."""
+    """Yield start and end of successive intervals, in seconds."""
     rng = np.random.default_rng([int(values['pattern']), 1])
     end = 0.0
     while True:
@@ -166,14 +166,14 @@ def intervals_s(values: Values, length_s: float) -> FloatArray:
 
 
 def install_intervals(values: Values, hooks: Hooks) -> None:
-    """Now and then part of the steam or of the heat goes elsewhere.
+    """At some times a part of the steam or of the heat is used elsewhere.
 
     An extraction or a feed water heater is in or out of service for hours:
 
         x = F(u) (1 + g w(t)),  w = 0 or 1
 
-    w begins with 0; how long it stays is drawn uniformly between two bounds, from
-    a generator of its own, so that ``pattern`` names one fixed sequence of times.
+    w begins with 0; the duration of each state is uniform between two bounds. A
+    separate random generator is used: ``pattern`` defines a fixed sequence of times.
     """
     edges = intervals_s(values, hooks.length_s).ravel()
 
@@ -190,7 +190,7 @@ def starts_days(values: Values) -> float:
 
 
 def problem(values: Values) -> str:
-    """Say which bounds are the wrong way round."""
+    """Return which bounds are in the wrong order."""
     for state in ('on', 'off'):
         if values[f'{state}_low_h'] > values[f'{state}_high_h']:
             return f'{state}_low_h must not exceed {state}_high_h'
@@ -215,10 +215,10 @@ INTERVALS = Effect(
 
 
 def install_diurnal(values: Values, hooks: Hooks) -> None:
-    """The power follows the time of day.
+    """The power depends on the time of day.
 
-    The pressure in the condenser follows the ambient air or the cooling water, and
-    the enthalpy drop follows it. Auxiliary load driven by the weather looks the same.
+    The pressure in the condenser depends on the ambient air or the cooling water, and
+    it changes the enthalpy drop. Auxiliary load due to the weather has the same effect.
 
         x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
     """

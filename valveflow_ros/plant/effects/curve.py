@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects in the curve itself: a bend, and a valve that no longer takes part."""
+"""Effects in the curve itself: a bump, and a valve that no longer opens."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _POINTS = 65
 
 
 def install_curve_shape(values: Values, hooks: Hooks) -> None:
-    """The curve has a bend that few straight pieces cannot follow.
+    """The curve has a bump that few straight pieces cannot describe.
 
-    Where one valve begins to open before the one before it is open, their overlap
-    raises the curve; too little overlap leaves a dent. The bump is a raised cosine:
+    If a valve begins to open before the previous one is open, their overlap raises
+    the curve; too little overlap lowers it. The bump is a raised cosine:
 
         x = F(u) + h (1 + cos(pi (u - u0) / w)) / 2,  |u - u0| <= w
     """
@@ -40,11 +40,11 @@ CURVE_SHAPE = Effect(
 
 
 def install_curve_step(values: Values, hooks: Hooks) -> None:
-    """One of several valves no longer takes part.
+    """One of several valves no longer opens.
 
-    The curve is the sum of valves that open one after the other. If one of them
-    sticks, breaks its stem, or the order of opening is changed, its share is
-    missing from the openings on where it should have opened:
+    The curve is the sum of valves that open in sequence. If one of them sticks, if
+    its stem is broken, or if the order of opening is changed, its part is missing
+    above the opening at which it should have opened:
 
         x = F(u) + s min(max((u - u1) / (u2 - u1), 0), 1),  t >= t0
     """
@@ -54,7 +54,7 @@ def install_curve_step(values: Values, hooks: Hooks) -> None:
 
 
 def problem(values: Values) -> str:
-    """Say what is wrong with the range of u."""
+    """Return what is wrong with the range of u."""
     return '' if values['u_from'] < values['u_to'] else 'u_from must be less than u_to'
 
 

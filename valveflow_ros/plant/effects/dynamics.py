@@ -14,14 +14,14 @@ from valveflow_ros.plant.unit import Region
 
 
 def install_region_lag(values: Values, hooks: Hooks) -> None:
-    """Above a load the unit stores more steam and answers later.
+    """Above a load the unit stores more steam and responds more slowly.
 
     The regional dynamics G_i of eq. (3): above ``level_mw`` the unit has the given
     time constant and delay instead of its own.
     """
     hooks.claim('region_lag')
     level = values['level_mw']
-    # A region that lay above the level keeps no power at which it would act.
+    # A region above the level gets an empty range of power, so it is never active.
     kept = [
         dataclasses.replace(region, power_to_mw=min(region.power_to_mw, level))
         for region in hooks.regions
@@ -43,10 +43,10 @@ REGION_LAG = Effect(
 
 
 def install_reheater(values: Values, hooks: Hooks) -> None:
-    """Most of the power comes behind the reheater, which fills slowly.
+    """Most of the power is generated after the reheater, which fills slowly.
 
-    The turbine models of IEEE (IEEEG1, TGOV1) split the power: a share is made in
-    front of the reheater at once, the rest follows its filling.
+    The turbine models of IEEE (IEEEG1, TGOV1) divide the power: a fraction is generated
+    before the reheater without lag, the rest follows its filling.
 
         y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
     """

@@ -16,7 +16,7 @@ def install_exponent(values: Values, hooks: Hooks) -> None:
 
     The 9/8 of eq. (1) comes from the drum boiler model of Bell and Astrom, fitted
     to one unit; ideal choked flow has 1.0. A unit whose true exponent is m + dm
-    has, against the u of eq. (1),
+    has, compared with the u of eq. (1),
 
         u_true = u (p / p_ref)^dm
     """
@@ -43,21 +43,21 @@ _LARGEST_USUAL_RATIO = 0.9
 
 
 def install_choked(values: Values, hooks: Hooks) -> None:
-    """Flow that is not choked: the pressure behind the valve matters.
+    """The flow is not choked: it depends on the pressure after the valve.
 
-    Below the critical ratio of the pressures behind and before a nozzle the flow
-    no longer depends on the pressure behind it; above, it follows an ellipse,
+    Below the critical ratio of the pressures after and before a nozzle the flow
+    does not depend on the pressure after it; above, it follows an ellipse,
 
         psi(r) = sqrt(1 - ((r - r_c) / (1 - r_c))^2),  r > r_c,
 
-    r_c being about 0.546 for superheated steam. The pressure behind the valve is
-    proportional to the flow (Stodola), r = kappa x / p. A curve identified under
-    sliding pressure has the usual psi inside, so only the departure from the
-    sliding line p_s shows; x is taken from the curve, F(u):
+    with r_c about 0.546 for superheated steam. The pressure after the valve is
+    proportional to the flow (Stodola), r = kappa x / p. A curve identified with
+    sliding pressure contains the usual psi, so only the deviation from the sliding
+    line p_s has an effect; x is taken from the curve, F(u):
 
         u_true = u psi(kappa x / p) / psi(kappa x / p_s(x))
 
-    IEC 60534 describes the same of control valves by an expansion factor.
+    IEC 60534 describes this effect in control valves by an expansion factor.
     """
     hooks.claim('choked')
     plan = hooks.unit.programme
@@ -86,12 +86,12 @@ CHOKED = Effect(
 
 
 def install_temperature(values: Values, hooks: Hooks) -> None:
-    """Main steam temperature: what the paper holds constant.
+    """The power depends on the main steam temperature, which the paper assumes constant.
 
     A turbine has a constant swallowing capacity, m ~ p / sqrt(T_K) (the cone law
-    of Stodola and Fluegel): less mass passes when the steam is hotter, about
-    -0.062 %/K at 539 degC. The enthalpy drop rises with the temperature and gives
-    part of it back; -0.03 to -0.06 %/K of power remain for main steam alone.
+    of Stodola and Fluegel): hotter steam has a smaller mass flow, about -0.062 %/K
+    at 539 degC. The enthalpy drop rises with the temperature and compensates a
+    part; -0.03 to -0.06 %/K of power remain for main steam only.
 
         x = F(u) (1 + k (T - T_ref))
     """

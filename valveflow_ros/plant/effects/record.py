@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects of the record alone: another clock, values that stand still, coarse steps, spikes."""
+"""Faults of the record only: another clock, constant values, coarse steps, spikes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from valveflow_ros.records import FloatArray
 
 
 def install_clock(values: Values, hooks: Hooks) -> None:
-    """The power carries stamps of another clock.
+    """The stamps of the power come from another clock.
 
         y in the row of time t was measured at t + d
 
-    With d > 0 the answer seems to come before its cause. Power and its noise move
-    together; the control of the unit, which reads no stamps, does not notice.
+    With d > 0 the response seems to come before its cause. Power and its noise are
+    shifted together; the control of the unit uses no stamps and is not affected.
     """
     hooks.claim('clock')
     hooks.lead_s = values['d_s']
@@ -43,9 +43,9 @@ CLOCK = Effect(
 
 
 def install_flatline(values: Values, hooks: Hooks) -> None:
-    """A record that stands still: a stuck transmitter or a gateway that repeats itself.
+    """A recorded value is constant: a stuck transmitter or a gateway that repeats a value.
 
-    From the onset the last value is written again and again; the plant goes on.
+    After the onset the last value is repeated in the record; the plant is not affected.
     """
     signal, start = values.signal(), values['t0_days'] * DAY_S
     end = start + values['minutes'] * 60.0
@@ -76,7 +76,7 @@ FLATLINE = Effect(
 
 
 def install_quantisation(values: Values, hooks: Hooks) -> None:
-    """A record with a coarse step: few bits, or a historian's dead band.
+    """The record has a coarse resolution: few bits, or a historian's dead band.
 
     Every value is rounded to the nearest multiple of ``step``.
     """
@@ -102,7 +102,7 @@ QUANTISATION = Effect(
 
 
 def _draw(values: Values) -> Iterator[tuple[float, float]]:
-    """Yield time in seconds and sign of one spike after the other."""
+    """Yield time in seconds and sign of successive spikes."""
     rng = np.random.default_rng([int(values['pattern']), 2])
     now = 0.0
     while True:
@@ -121,10 +121,10 @@ def spikes(values: Values, length_s: float) -> FloatArray:
 
 
 def install_spikes(values: Values, hooks: Hooks) -> None:
-    """Single wild values in a record: disturbed transmission.
+    """The record has single outliers: disturbed transmission.
 
-    Their times are a Poisson process and their signs random, drawn from a
-    generator of their own, so that ``pattern`` names one fixed set of them.
+    Their times are a Poisson process and their signs are random. They come from a
+    separate random generator, so that ``pattern`` defines a fixed set of them.
     """
     signal = values.signal()
     h = hooks.unit.sample_period_s
@@ -142,7 +142,7 @@ def install_spikes(values: Values, hooks: Hooks) -> None:
 
 
 def starts_days(values: Values) -> float:
-    """Return when the first spike comes."""
+    """Return the time of the first spike."""
     return next(_draw(values))[0] / DAY_S
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects between measured and true position: slack, friction, servo, a stop."""
+"""Faults of the actuator: backlash, friction, a slow servo, a stop."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from valveflow_ros.plant.effect import BEFORE_SENSOR, Effect, Hooks, Values
 
 
 def install_backlash(values: Values, hooks: Hooks) -> None:
-    """A loose linkage between the position sensor and the plug.
+    """The linkage between the position sensor and the plug is loose.
 
-    The plug follows only when one of the two flanks of the slack pushes it (the
-    play operator); the loop this draws is as wide at any speed.
+    The plug follows only if it is pushed by one of the two sides of the slack (the
+    play operator); the width of the hysteresis loop does not depend on the speed.
 
         plug = min(max(plug before, V - w / 2), V + w / 2)
     """
@@ -31,9 +31,9 @@ BACKLASH = Effect(
 def install_stiction(values: Values, hooks: Hooks) -> None:
     """The valve sticks and then slips.
 
-    The two-parameter picture of Choudhury in the form of He: the valve stays until
-    the pull has grown beyond (S + J) / 2, then slips by J and stays (S - J) / 2
-    behind. S is the width of the band, J of the jump; J = 0 is plain backlash.
+    This is the two-parameter model of Choudhury in the form of He: the valve stays
+    until the force exceeds (S + J) / 2, then slips by J and lags by (S - J) / 2.
+    S is the width of the band, J that of the jump; J = 0 is pure backlash.
     """
     before = values['before_sensor']
     hooks.claim('stiction', 'before the sensor' if before else 'behind the sensor')
@@ -43,7 +43,7 @@ def install_stiction(values: Values, hooks: Hooks) -> None:
 
 
 def problem(values: Values) -> str:
-    """Say that the jump is too large."""
+    """Return a message if the jump is too large."""
     fits = values['j_percent'] <= values['s_percent']
     return '' if fits else 'j_percent must not exceed s_percent'
 
@@ -64,8 +64,8 @@ STICTION = Effect(
 def install_rate_limit(values: Values, hooks: Hooks) -> None:
     """The servo is slow.
 
-    Oil flow and pump bound the speed of the stem; a fast move takes the longer the
-    larger it is, a slow one is not affected.
+    Oil flow and pump limit the speed of the stem: large fast moves take longer,
+    slow moves are not affected.
     """
     before = values['before_sensor']
     hooks.claim('rate_limit', 'before the sensor' if before else 'behind the sensor')
@@ -84,7 +84,7 @@ RATE_LIMIT = Effect(
 
 
 def install_saturation(values: Values, hooks: Hooks) -> None:
-    """A stop keeps the valve from opening fully.
+    """A stop prevents the valve from opening fully.
 
     A mechanical or a configured limit:
 
