@@ -177,6 +177,33 @@ def _sample_reader(quality: Sequence[int]) -> Callable[[bytes, int], list[Row]]:
     return read
 
 
+def sample_warnings(data: bytes, settings: Settings) -> list[str]:
+    """Return what in a PlantSample does not agree with the parameters.
+
+    Raises
+    ------
+    ValueError
+        The bytes are no PlantSample.
+    """
+    sample, found = _sample(data), []
+    for info in SIGNALS:
+        name, code = f'{info.topic}_unit', getattr(sample, f'{info.topic}_quality')
+        named = settings.text(name)
+        sent = info.required or code != PlantSample.QUALITY_UNKNOWN
+        if sent and unit_of(info.signal, named) != unit_of(info.signal, info.unit):
+            found.append(
+                f'{name} {named} does not apply to PlantSample, which is taken in {info.unit}.'
+            )
+    tag, frame_id = settings.text('unit_tag'), sample.header.frame_id
+    # Left empty, it names no unit.
+    if frame_id not in ('', tag):
+        found.append(
+            f"PlantSample has the frame_id '{frame_id}', but unit_tag is '{tag}'. Check that the "
+            'samples are of this unit.'
+        )
+    return found
+
+
 def with_todays_codes(data: bytes) -> bytes:
     """Return a PlantSample in whose codes of quality 0 was good, with those of now.
 
