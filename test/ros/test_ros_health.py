@@ -260,7 +260,7 @@ def test_an_impossible_value_is_said_aloud_with_the_unit_it_would_fit() -> None:
     assert item.sentence == (
         '7 new readings were rejected. The last one, 162.5 MPa, is impossible '
         '(believed: 0.05 to 40 MPa). '
-        'Is main_steam_pressure_unit kPa or bar or psi rather than MPa?'
+        "It would be possible in bar: set main_steam_pressure_unit to 'bar'."
     )
     scene.says(Level.OK, 'Hz', 'main_steam_pressure')
 
@@ -272,14 +272,21 @@ def test_the_value_is_named_as_it_was_sent() -> None:
     scene.says(Level.WARN, 'The last one, 65 fraction, is impossible')
     scene.counts['valve_opening']['impossible'] = 2
     scene.health.note('valve_opening', [(1, Signal.VALVE_OPENING, 6500.0, 0)])
-    scene.says(Level.WARN, 'Is valve_opening_unit percent rather than fraction?')
+    scene.says(Level.WARN, "possible in %: set valve_opening_unit to 'percent'.")
 
 
 def test_a_stamped_value_has_no_other_unit() -> None:
-    scene = Scene(valve_opening_unit='fraction')
-    scene.health.note(PLANT_SAMPLE, [(1, Signal.VALVE_OPENING, 650.0, 0)])
-    scene.counts['valve_opening']['impossible'] = 1
-    scene.says(Level.WARN, 'The last one, 650 %, is impossible (believed: -2 to 105 %).')
+    scene = Scene(valve_opening_unit='fraction', main_steam_pressure_unit='bar')
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
+    scene.hear(PLANT_SAMPLE)
+    for topic, signal, value, words in (
+        ('valve_opening', Signal.VALVE_OPENING, 650.0, '650 %, is impossible (believed: -2 to'),
+        ('main_steam_pressure', Signal.MAIN_STEAM_PRESSURE, 124.86,
+         'It would be possible in bar: convert to MPa before sending.'),
+    ):  # fmt: skip
+        scene.health.note(PLANT_SAMPLE, [(1, signal, value, 0)])
+        scene.counts[topic]['impossible'] = 1
+        scene.says(Level.WARN, words, topic)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.signals.units import UNITS, Unit, unit_of
+from valveflow_ros.signals.units import Unit, unit_of
 
 Row = tuple[int, int, float, int]
 """A reading as ``(time_ns, signal, value, quality)``, as `Readings.of` takes it."""
@@ -217,13 +217,6 @@ def with_todays_codes(data: bytes) -> bytes:
         name = f'{info.topic}_quality'
         setattr(sample, name, min(getattr(sample, name) + 1, PlantSample.QUALITY_BAD))
     return serialize_message(sample)
-
-
-def plausible_units(signal: Signal, settings: Settings, sent: float) -> list[str]:
-    """Return the units in which ``sent`` would be a possible value of ``signal``."""
-    low, high = plausible_range(signal, settings)
-    named = {unit: name for name, unit in UNITS[signal].items()}  # each unit once
-    return [name for unit, name in named.items() if low <= sent * unit.scale + unit.offset <= high]
 
 
 def plausible_range(signal: Signal, settings: Settings) -> tuple[float, float]:

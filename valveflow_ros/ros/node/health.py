@@ -10,9 +10,10 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rclpy.node import Node
 
-from valveflow_ros.errors import counted
+from valveflow_ros.errors import counted, listed
 from valveflow_ros.fit.result import weaknesses
 from valveflow_ros.logs import Qos, RecorderState
 from valveflow_ros.monitoring.alarm_state import Alarm, AlarmState
@@ -21,14 +22,14 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, SignalInfo
 from valveflow_ros.report.words import duration
-from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range, plausible_units
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range
 from valveflow_ros.ros.encoding import NOT_YET
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.ros.node.recording import Recording, recorded_qos
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.align import REASONS
-from valveflow_ros.signals.units import unit_of
+from valveflow_ros.signals.units import better_units, unit_of
 
 _NO_LEAD = -(2**63)
 _FAR_BEHIND_NS = 120 * NS_PER_S
@@ -268,17 +269,23 @@ class InputHealth:
             return f'So far: {", ".join(reasons)}.'
         name, value = found
         low, high = plausible_range(info.signal, self.settings)
-        believed = f'believed: {low:g} to {high:g} {info.unit}'
-        if name == PLANT_SAMPLE:
-            return f'The last one, {value:g} {info.unit}, is impossible ({believed}).'
-        named = self.settings.text(f'{info.topic}_unit')
+        stamped = name == PLANT_SAMPLE
+        named = info.unit if stamped else self.settings.text(f'{info.topic}_unit')
         unit = unit_of(info.signal, named)
         sent = (value - unit.offset) / unit.scale
-        text = f'The last one, {sent:g} {named}, is impossible ({believed}).'
-        fitting = [u for u in plausible_units(info.signal, self.settings, sent) if u != named]
-        if fitting:
-            text += f' Is {info.topic}_unit {" or ".join(fitting)} rather than {named}?'
-        return text
+        text = (
+            f'The last one, {sent:g} {named}, is impossible '
+            f'(believed: {low:g} to {high:g} {info.unit}).'
+        )
+        fitting = better_units(info.signal, np.array([sent]), named, (low, high))
+        if not fitting or self.settings.output_unit != 'MW':
+            return text  # what is usual is known of a steam unit only
+        suiting = listed(fitting, 'or')
+        if stamped:
+            return f'{text} It would be possible in {suiting}: convert to {named} before sending.'
+        # YAML takes a bare % for something else.
+        choices = listed([f"'{'percent' if u == '%' else u}'" for u in fitting], 'or')
+        return f'{text} It would be possible in {suiting}: set {info.topic}_unit to {choices}.'
 
     def _stamps(self, number: int) -> tuple[str, str]:
         """Return what is wrong with the stamps since the last look, and what is only odd.
