@@ -208,10 +208,10 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
     overrides = [ros('refit_periodd', 30.0), ros('use_sim_time', False), ros('record', False)]
     node = MonitorNode(context=context, parameter_overrides=overrides)
     (sentence,) = unknown_overrides(node)
-    assert sentence == "Parameter 'refit_periodd' does not exist, did you mean 'refit_period'."
+    assert sentence == "Parameter 'refit_periodd' does not exist; did you mean 'refit_period'?"
     (item,) = node.unknown_parameters()
     assert (item.name, item.level) == ('parameters', Level.WARN)
-    assert item.sentence == f'{sentence} Ignored.'
+    assert item.sentence == f'{sentence} It is ignored.'
     node.destroy_node()
 
 
