@@ -92,6 +92,17 @@ def test_a_healthy_input_says_its_rate() -> None:
     assert {f'Readings {reason.replace("_", " ")}' for reason in REASONS} <= set(values)
 
 
+def test_no_rate_is_told_before_one_is_known() -> None:
+    scene = Scene()
+    scene.statistics['valve_opening'] = TopicStatistics()
+    scene.statistics['valve_opening'].note_arrival(1, NOW)
+    scene.statistics['valve_opening'].note_number(1)
+    scene.says(Level.OK, 'The first message has come.')
+    assert scene.item().values['Actual frequency (Hz)'] is None
+    scene.hear('valve_opening', NOW + 6.0)
+    scene.says(Level.OK, '1 Hz.')
+
+
 def reading_at(off_s: float, number: int = int(Signal.VALVE_OPENING)) -> list[Any]:
     return [(time.time_ns() + round(off_s * NS_PER_S), number, 50.0, 0)]
 

@@ -226,7 +226,10 @@ class InputHealth:
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
         hz = received.rate_hz()
-        rate = f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
+        if hz is None:
+            rate = 'The first message has come'
+        else:
+            rate = f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
         return Level.OK, f'{rate}; {behind}.' if behind else f'{rate}.'
 
     def _judge_silent(

@@ -173,9 +173,9 @@ class TopicStatistics:
         """Return how long ago the newest message came; None before the first."""
         return None if self.last_s is None else now_s - self.last_s
 
-    def rate_hz(self) -> float:
-        """Return the mean rate of late, 0 while it is not known."""
-        return 1.0 / self.period_s if self.period_s else 0.0
+    def rate_hz(self) -> float | None:
+        """Return the mean rate of late, None while it is not known."""
+        return 1.0 / self.period_s if self.period_s else None
 
     def stale(self, now_s: float) -> bool:
         """Return True if messages came once and come no more."""
