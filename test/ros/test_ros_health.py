@@ -208,6 +208,24 @@ def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
         assert scene.item(info.topic).values['Topic'] == '/plant/plant_sample'
 
 
+@pytest.mark.parametrize('stamped', [True, False])
+def test_a_command_that_was_never_sent_is_no_warning(stamped: bool) -> None:
+    """Not even where the sample that could bring it is silent, or comes from two."""
+    scene = Scene()
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
+    if stamped:
+        scene.hear(PLANT_SAMPLE)
+        scene.statistics[PLANT_SAMPLE].lost = 3
+        scene.publishers = {PLANT_SAMPLE: Publishers(2)}
+        scene.says(Level.STALE, 'has been silent for 60.0 s', at=NOW + 60.0)
+    for at in (NOW, NOW + 60.0):
+        scene.says(Level.OK, 'it is optional.', 'valve_command', at=at)
+    # Once it was sent, its silence is told.
+    scene.counts['valve_command']['accepted'] = 1
+    scene.hear('valve_command')
+    scene.says(Level.STALE, 'has been silent', 'valve_command', at=NOW + 60.0)
+
+
 def test_a_stamped_sample_of_the_wrong_type_is_seen_before_it_is_heard() -> None:
     scene = Scene()
     scene.statistics = {name: TopicStatistics() for name in TOPICS}

@@ -198,6 +198,11 @@ class InputHealth:
         rejected = self._new(info.topic, 'rejected', sum(counts[r] for r in _REJECTED))
         lost = self._new(info.topic, 'lost', received.lost)
         off, behind = self._stamps(info.signal)
+        if name == PLANT_SAMPLE and not info.required and not any(counts.values()):
+            # What is wrong with the message is told with the signals that it brings.
+            return Level.OK, (
+                f'{topic} has none, or leaves {info.topic}_quality at 0, unknown; it is optional.'
+            )
         if seen.wrong_types:
             return _wrong_type(topic, seen)
         if received.stale(now_s):
@@ -217,10 +222,6 @@ class InputHealth:
             return Level.WARN, f'{rejected} new readings were rejected. {why}'
         if received.without_time + received.waiting == received.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
-        if name == PLANT_SAMPLE and not info.required and not any(counts.values()):
-            return Level.OK, (
-                f'{topic} has none, or leaves {info.topic}_quality at 0, unknown; it is optional.'
-            )
         if off:
             return Level.WARN, off
         if lost:
@@ -243,7 +244,7 @@ class InputHealth:
                 f'{topic} is published as best effort and asked for as reliable, so nothing '
                 'comes: set input_reliability, and qos_overrides if given, to best_effort.'
             )
-        if not info.required and not seen.right:
+        if not info.required:
             return Level.OK, f'{topic} is not sent; it is optional.'
         if listening_s < _PATIENCE_S:
             return Level.OK, f'Waiting for {topic}.'
