@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -344,7 +345,7 @@ def test_a_topic_without_any_time_points_to_the_clock() -> None:
 def test_the_message_follows_rep_107() -> None:
     items = [
         Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
-        Item('recorder', Level.ERROR, 'Broken.', {'On': False}),
+        Item('recorder', Level.ERROR, 'Broken.', {'On': False, 'Shift (MW)': math.nan}),
     ]
     message = diagnostics_message(items, 'unit_1/monitor', 'HV101', 5 * 10**9)
     assert message.header.stamp.sec == 5
@@ -357,7 +358,7 @@ def test_the_message_follows_rep_107() -> None:
     )
     assert [(v.key, v.value) for v in first.values] == [('Rate (Hz)', '1'), ('Age (s)', 'unknown')]
     assert second.level == DiagnosticStatus.ERROR
-    assert second.values[0].value == 'no'
+    assert [v.value for v in second.values] == ['no', 'unknown']
     for level in Level:
         assert bytes([level]) == getattr(DiagnosticStatus, level.name)
 
@@ -414,6 +415,17 @@ def said_of(monitor: Monitor, notes: tuple[str, ...], identifiable: bool = True)
     item = fit_item(seen, WORKER, 1.0)
     assert item.values['Notes'] == ' '.join(notes)
     return item
+
+
+def test_what_is_not_learnt_yet_is_unknown(monitor: Monitor) -> None:
+    names = [
+        'Noise of the integrated input (% MPa^e)',
+        'Noise of the power (MW)',
+        'Temperature spread (K)',
+    ]
+    before, since = (fit_item(made, WORKER, None).values for made in (Monitor(WORK), monitor))
+    assert [before[name] for name in names] == [None] * 3
+    assert None not in [since[name] for name in names]
 
 
 def test_a_weak_curve_says_so(monitor: Monitor) -> None:
