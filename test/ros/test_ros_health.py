@@ -333,6 +333,16 @@ def test_other_rejections_are_told_by_reason(reason: str, words: str) -> None:
     scene.says(Level.WARN, f'4 new readings were rejected. So far: {words}.')
 
 
+def test_bad_quality_is_told() -> None:
+    scene = Scene()
+    scene.counts['valve_opening']['bad_quality'] = 4
+    scene.says(
+        Level.WARN,
+        '4 new readings were rejected. The sender marked them as bad quality, or does not set '
+        'valve_opening_quality, which is then 0, unknown; 1 is good.',
+    )
+
+
 def test_a_topic_without_any_time_points_to_the_clock() -> None:
     scene = Scene()
     scene.statistics['valve_opening'].without_time = scene.statistics['valve_opening'].received

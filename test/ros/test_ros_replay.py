@@ -116,6 +116,7 @@ def test_a_log_is_heard_again_as_it_stands_with_its_times_on_the_clock(
         (['runs'], 'give one of: runs/one, runs/two.', 1),
         (['runs', '--verify'], 'give one of: runs/one, runs/two.', 1),
         (['plain.mcap', '--verify'], 'is no recording of the monitor', 1),
+        (['plain.mcap', '--verify'], 'The progress is printed from time to time.', 1),
         (['plain.mcap', '--rate', '-1'], 'from 0 to 1000000', 2),
         (['plain.mcap', '--wait', '0.2'], 'Nobody listened within 0.2 s', 1),
     ],

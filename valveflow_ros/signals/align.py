@@ -43,7 +43,7 @@ from valveflow_ros.records import (
 REASONS = (
     'accepted',  # taken into the table
     'not_finite',  # NaN or infinite
-    'bad_quality',  # the sender itself calls it bad, or does not say
+    'bad_quality',  # the sender marked it as bad quality, or set no quality
     'impossible',  # outside the plausible range of its signal
     'duplicate',  # same stamp as the one before
     'out_of_order',  # older than the newest of its own signal

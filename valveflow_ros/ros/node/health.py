@@ -266,8 +266,8 @@ class InputHealth:
                 return f'The last stamp is {off} behind the newest one used.'
             if bad_quality:
                 return (
-                    f'The sender calls them bad, or does not set {info.topic}_quality, which is '
-                    'then 0, unknown; 1 is good.'
+                    'The sender marked them as bad quality, or does not set '
+                    f'{info.topic}_quality, which is then 0, unknown; 1 is good.'
                 )
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
             return f'So far: {", ".join(reasons)}.'

@@ -404,7 +404,7 @@ class StateStore:
             # Nobody would notice otherwise, as what was lost is not shown. Until the next start,
             # which continues this run.
             return Item('state', Level.WARN, self.sentence, values)
-        return Item('state', Level.OK, 'The state is saved in its time.', values)
+        return Item('state', Level.OK, 'The state is saved regularly.', values)
 
     def close(self) -> None:
         """Release the folder after the pending save has finished."""
