@@ -38,7 +38,7 @@ from valveflow_ros.ros import demo, replay_main, simulator_main, watch_main
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.engine import example_curve
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.node.recording import check_record_directory
+from valveflow_ros.ros.node.recording import check_record_directory, new_folder
 from valveflow_ros.ros.outputs import OUTPUTS
 
 pytestmark = pytest.mark.ros
@@ -441,6 +441,18 @@ def test_a_folder_that_will_do_is_left_as_it_is(tmp_path: Path) -> None:
     check_record_directory(recorded_to(tmp_path))
     check_record_directory(recorded_to(tmp_path / 'a' / 'b'))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_is_named_by_its_absolute_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for given in ('', 'valveflow_recordings'):
+        folder = new_folder(recorded_to(given), 1.7e9)
+        assert folder.parent == tmp_path / 'valveflow_recordings'
+    monkeypatch.setattr(os, 'access', lambda *_: False)
+    with pytest.raises(RecordingError, match=f'^{tmp_path}/records: cannot be made'):
+        check_record_directory(recorded_to('records'))
 
 
 def test_a_folder_that_cannot_be_recorded_into_is_refused(

@@ -332,7 +332,7 @@ class Session:
             'topics': {**self.inputs, **self.outputs},
             'began': recording.began,
             'begun_ns': self._messages.begun_ns,
-            'recording': None if folder is None else str(folder.absolute()),
+            'recording': None if folder is None else str(folder),
         }
 
     def _send(self, outputs: Iterable[Output]) -> None:
