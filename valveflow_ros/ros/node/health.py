@@ -183,7 +183,8 @@ class InputHealth:
             'Messages sent before the first /clock': received.before_clock,
             'Messages that wait for the first /clock': received.waiting,
         }
-        return values | {f'Readings {r.replace("_", " ")}': counts[r] for r in REASONS}
+        # The engine goes on from a saved state and counts on; the intake begins anew.
+        return values | {f'Readings {r.replace("_", " ")} in all runs': counts[r] for r in REASONS}
 
     def _judge(
         self,
@@ -270,7 +271,7 @@ class InputHealth:
                     f'{info.topic}_quality, which is then 0, unknown; 1 is good.'
                 )
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
-            return f'So far: {", ".join(reasons)}.'
+            return f'In all runs so far: {", ".join(reasons)}.'
         name, value = found
         low, high = plausible_range(info.signal, self.settings)
         stamped = name == PLANT_SAMPLE
@@ -357,7 +358,7 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
         'Age of the curve (s)': age_s,
         'Special segments in the window': monitor.segments,
         'Special samples in the window': monitor.special_samples,
-        'Samples taken': monitor.rows,
+        'Samples taken in all runs': monitor.rows,
         'Noise of the integrated input (% MPa^e)': noise.input if noise.learnt else None,
         'Noise of the power (MW)': noise.power_mw if noise.learnt else None,
         'Temperature spread (K)': spread_k,
@@ -427,7 +428,7 @@ def _count_values(alarm: Alarm) -> dict[str, object]:
     """Return what an announcement may not have told yet."""
     until_ns = alarm.shelved_until_ns
     return {
-        'Occurrences': alarm.occurrence,
+        'Occurrences in all runs': alarm.occurrence,
         'Announcements suppressed by alarm_flood': alarm.held,
         'Shelved until (s since 1970)': None if until_ns is None else until_ns // 10**9,
     }
