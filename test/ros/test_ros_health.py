@@ -344,6 +344,16 @@ def test_bad_quality_is_told() -> None:
     )
 
 
+def test_what_was_rejected_in_an_earlier_run_is_no_news() -> None:
+    scene = Scene()
+    counts = scene.counts['valve_opening']
+    counts['impossible'], counts['bad_quality'] = 40, 4
+    scene.health.begin(scene.counts)
+    scene.says(Level.OK, '1 Hz.')
+    counts['impossible'] += 1
+    scene.says(Level.WARN, '1 new readings were rejected. In all runs so far: bad quality 4,')
+
+
 def test_a_topic_without_any_time_points_to_the_clock() -> None:
     scene = Scene()
     scene.statistics['valve_opening'].without_time = scene.statistics['valve_opening'].received

@@ -106,6 +106,13 @@ class InputHealth:
         self._used: dict[str, tuple[int, float]] = {}
         self._newest_ns = 0
 
+    def begin(self, counts: Mapping[str, Mapping[str, int]]) -> None:
+        """Take what became of the readings of earlier runs: it is no news."""
+        for topic, reasons in counts.items():
+            self._new(topic, 'rejected', sum(reasons[r] for r in _REJECTED))
+            for reason in ('bad_quality', 'time_outlier'):
+                self._new(topic, reason, reasons[reason])
+
     def note(self, name: str, rows: Sequence[Row]) -> None:
         """Remember the stamps, and the last impossible value of each signal, to name it."""
         host_ns = time.time_ns()

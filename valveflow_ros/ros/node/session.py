@@ -157,6 +157,7 @@ class Session:
         )  # fmt: skip
         if not self._begun:
             self._begin()
+            self._health.begin(self.engine.aligner.counts())
             self._begun = True
         self._intake = intake
         self._listening_since_s = time.monotonic()
