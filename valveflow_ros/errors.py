@@ -31,7 +31,8 @@ class ParameterError(InputError):
     def __init__(self, name: str, problem: str) -> None:
         self.name = name
         self.problem = problem
-        super().__init__(f"Parameter '{name}' {problem}.")
+        end = '' if problem.endswith('?') else '.'
+        super().__init__(f"Parameter '{name}' {problem}{end}")
 
 
 class RecordingError(ValveflowError):

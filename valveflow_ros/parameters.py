@@ -509,7 +509,7 @@ def parameter(name: str) -> Parameter:
     row = PARAMETERS.get(name)
     if row is None:
         near = difflib.get_close_matches(str(name), PARAMETERS, n=1)
-        hint = f", did you mean '{near[0]}'" if near else ''
+        hint = f"; did you mean '{near[0]}'?" if near else ''
         raise ParameterError(name, f'does not exist{hint}')
     return row
 

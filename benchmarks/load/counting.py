@@ -83,7 +83,7 @@ class Account:
 def fed(ears: Ears, topic: str) -> int:
     """Return how many readings of a signal the engine has judged; late ones are accepted too."""
     kinds = (reason.replace('_', ' ') for reason in REASONS if reason != 'late')
-    return sum(ears.number(f'input {topic}', f'Readings {kind}') for kind in kinds)
+    return sum(ears.number(f'input {topic}', f'Readings {kind} in all runs') for kind in kinds)
 
 
 def account(

@@ -182,8 +182,8 @@ class History:
         ears = self._ears
         self._player.wait_for_listeners(_PATIENCE_S)
         self._play(self._table)
-        ears.until(lambda: ears.number('fit', 'Samples taken'), 'the first row')
-        ears.rest(lambda: ears.number('fit', 'Samples taken'))
+        ears.until(lambda: ears.number('fit', 'Samples taken in all runs'), 'the first row')
+        ears.rest(lambda: ears.number('fit', 'Samples taken in all runs'))
         ears.ask_for_refit()
         ears.until(lambda: ears.text('fit', 'Model'), 'a curve')
 

@@ -158,7 +158,7 @@ class Run:
             assert sender.line(ears) == 'ready'
         if history is not None:
             history.hold()
-            ears.rest(lambda: ears.number('fit', 'Samples taken'), 1)
+            ears.rest(lambda: ears.number('fit', 'Samples taken in all runs'), 1)
         before = {s.topic: fed(ears, s.topic) for s in streams}
         self._send()
         ears.rest(lambda: [ears.values(f'input {s.topic}').get('Messages received') for s in

@@ -38,6 +38,18 @@ def test_every_kind_of_log_holds_the_same(run, folder):
     assert (folder / 'bag' / 'metadata.yaml').is_file()
 
 
+def test_the_files_that_were_written_are_named(run, tmp_path):
+    log, beside, truth = (tmp_path / n for n in ('a.mcap', 'metadata.yaml', 'truth.json'))
+    ran = run('simulate', '-o', log, '--truth', truth, *SHORT)
+    assert ran.out.endswith(f'\nWrote {log}, {beside} and {truth}.\n')
+    assert set(tmp_path.iterdir()) == {log, beside, truth}
+    table = tmp_path / 'a.csv'
+    other = tmp_path / 'b.mcap'
+    assert f'Wrote {other}.' in run('simulate', '-o', other, *SHORT).out
+    # Nothing but the file.
+    assert run('simulate', '-o', table, *SHORT, '--quiet').out == f'Wrote {table}.\n'
+
+
 def test_months_follow_one_another(run, folder):
     """It begins when it is told to, in UTC where no zone is named; nothing else changes."""
     for unit in ('paper', 'choked'):

@@ -408,6 +408,21 @@ def test_every_bad_input_is_one_sentence(tmp_path):
         assert '\n' not in str(caught.value)
 
 
+def test_the_recordings_in_a_folder_of_several_are_named(tmp_path):
+    for name in ('a', 'b', 'notes'):
+        (tmp_path / name).mkdir()
+    (tmp_path / 'a' / 'a_0.mcap').touch()
+    (tmp_path / 'b' / 'b_0.mcap.part').touch()
+    with pytest.raises(RecordingError) as caught:
+        open_log(tmp_path)
+    assert str(caught.value).endswith(f'; give one of: {tmp_path / "a"}, {tmp_path / "b"}.')
+    for number in range(10):
+        (tmp_path / f'c{number}').mkdir()
+        (tmp_path / f'c{number}' / 'log.db3').touch()
+    with pytest.raises(RecordingError, match=r'give one of: 2 earlier ones, /.*/c0, .*/c9\.$'):
+        open_log(tmp_path)
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason='nothing is unreadable for root')
 def test_an_unreadable_file_is_one_sentence(tmp_path):
     path, _, _ = write_chunks(tmp_path / 'log')

@@ -150,7 +150,8 @@ def test_what_was_flushed_is_readable_while_recording(tmp_path):
     recorder = recorder_of(tmp_path / 'log')
     record(recorder, 0, 100)
     wait_for(lambda: recorder.status().written == 100)
-    assert recorder.status().file == 'log_0.mcap'
+    assert recorder.status().file == 'log_0.mcap.part'
+    assert (tmp_path / 'log' / recorder.status().file).is_file()
     assert values_on_disk(tmp_path / 'log') == list(range(100))
     assert recorder.close().written == 100
 

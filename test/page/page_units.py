@@ -55,7 +55,11 @@ def told(key: str = NODE, tag: str = 'U1', seconds: int = 200) -> Unit:
     items = {
         'input valve_opening': (3, 'silent for 9 s.', {'Messages lost on the way': '4'}),
         'input generated_power': (0, '1 Hz.', {'Messages lost on the way': '0'}),
-        'fit': (0, 'A curve.', {'Age of the curve (s)': '431.5', 'Samples taken': '200'}),
+        'fit': (
+            0,
+            'A curve.',
+            {'Age of the curve (s)': '431.5', 'Samples taken in all runs': '200'},
+        ),
         'recorder': (0, 'Recording.', {'Messages dropped': 'unknown'}),
     }
     unit.take(HEALTH, {'header': head(START_NS, tag), 'status': [

@@ -38,6 +38,7 @@ AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader
 typesys = pytest.importorskip('rosbags.typesys')
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
+TAKEN = 'Samples taken in all runs'
 DAYS, SEED = 0.3, 7
 FAULT = 'gain_step:g=-0.12,t0_days=0.25'
 FAULT_NS = DEFAULT_START_NS + round(0.25 * 86400e9)
@@ -60,9 +61,7 @@ def test_a_run_from_the_plant_to_the_disk(
     listener.until(lambda: plant.poll() is not None, 'the end of the plant')
     assert plant.returncode == 0, processes.output(plant)
     rows = round(DAYS * 86400)
-    listener.until(
-        lambda: listener.value('fit', 'Samples taken') == str(rows), 'the last sample', 60.0
-    )
+    listener.until(lambda: listener.value('fit', TAKEN) == str(rows), 'the last sample', 60.0)
     nothing_lost(listener, rows)
     the_latched_curve(listener)
     monitor.send_signal(signal.SIGTERM)
@@ -87,7 +86,7 @@ def test_a_run_from_the_plant_to_the_disk(
 
 def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None:
     """Change a live parameter early, then wait for the alarm of the fault and acknowledge it."""
-    listener.until(lambda: listener.value('fit', 'Samples taken') not in ('', '0'), 'samples')
+    listener.until(lambda: listener.value('fit', TAKEN) not in ('', '0'), 'samples')
     wanted = Parameter('alarm_on_delay', value=90).to_parameter_msg()
     answer = listener.call(
         SetParameters, 'set_parameters', SetParameters.Request(parameters=[wanted])
@@ -129,7 +128,7 @@ def nothing_lost(listener: Listener, rows: int) -> None:
         item = f'input {SIGNALS[signal_].topic}'
         assert listener.value(item, 'Messages lost on the way') == '0'
         assert listener.value(item, 'Messages received') == str(rows)
-        assert listener.value(item, 'Readings accepted') == str(rows)
+        assert listener.value(item, 'Readings accepted in all runs') == str(rows)
     assert listener.value('recorder', 'Messages dropped') == '0'
 
 
@@ -259,7 +258,7 @@ def test_ending_during_a_refit_finishes_the_file_at_once(
     plant = start_plant(processes, days=0.15, stamped=True)
     listener.until(lambda: plant.poll() is not None, 'the end of the plant')
     samples = round(0.15 * 86400)
-    listener.until(lambda: listener.value('fit', 'Samples taken') == str(samples), 'the samples')
+    listener.until(lambda: listener.value('fit', TAKEN) == str(samples), 'the samples')
     (worker,) = [
         child for child in psutil.Process(monitor.pid).children()
         if any('valveflow_ros.ros.worker' in word for word in child.cmdline())

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -89,7 +90,19 @@ def test_a_healthy_input_says_its_rate() -> None:
     assert values['Actual frequency (Hz)'] == pytest.approx(1.0)
     assert values['Age of the newest message (s)'] == pytest.approx(0.5)
     assert values['Publishers'] == 1
-    assert {f'Readings {reason.replace("_", " ")}' for reason in REASONS} <= set(values)
+    reasons = {f'Readings {reason.replace("_", " ")} in all runs' for reason in REASONS}
+    assert reasons <= set(values)
+
+
+def test_no_rate_is_told_before_one_is_known() -> None:
+    scene = Scene()
+    scene.statistics['valve_opening'] = TopicStatistics()
+    scene.statistics['valve_opening'].note_arrival(1, NOW)
+    scene.statistics['valve_opening'].note_number(1)
+    scene.says(Level.OK, 'The first message has come.')
+    assert scene.item().values['Actual frequency (Hz)'] is None
+    scene.hear('valve_opening', NOW + 6.0)
+    scene.says(Level.OK, '1 Hz.')
 
 
 def reading_at(off_s: float, number: int = int(Signal.VALVE_OPENING)) -> list[Any]:
@@ -197,6 +210,24 @@ def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
         assert scene.item(info.topic).values['Topic'] == '/plant/plant_sample'
 
 
+@pytest.mark.parametrize('stamped', [True, False])
+def test_a_command_that_was_never_sent_is_no_warning(stamped: bool) -> None:
+    """Not even where the sample that could bring it is silent, or comes from two."""
+    scene = Scene()
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
+    if stamped:
+        scene.hear(PLANT_SAMPLE)
+        scene.statistics[PLANT_SAMPLE].lost = 3
+        scene.publishers = {PLANT_SAMPLE: Publishers(2)}
+        scene.says(Level.STALE, 'has been silent for 60.0 s', at=NOW + 60.0)
+    for at in (NOW, NOW + 60.0):
+        scene.says(Level.OK, 'it is optional.', 'valve_command', at=at)
+    # Once it was sent, its silence is told.
+    scene.counts['valve_command']['accepted'] = 1
+    scene.hear('valve_command')
+    scene.says(Level.STALE, 'has been silent', 'valve_command', at=NOW + 60.0)
+
+
 def test_a_stamped_sample_of_the_wrong_type_is_seen_before_it_is_heard() -> None:
     scene = Scene()
     scene.statistics = {name: TopicStatistics() for name in TOPICS}
@@ -233,7 +264,7 @@ def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent() -> None:
         counts['impossible'] += 1
         level, words = (
             (Level.WARN, '1 new readings were rejected.') if second <= 10
-            else (Level.ERROR, f'Nothing usable has come for {second} s. So far: impossible ')
+            else (Level.ERROR, f'Nothing usable has come for {second} s. In all runs so far: impo')
         )  # fmt: skip
         scene.says(level, words, at=NOW + 0.5 + second)
     # One good one among them is enough.
@@ -260,7 +291,7 @@ def test_an_impossible_value_is_said_aloud_with_the_unit_it_would_fit() -> None:
     assert item.sentence == (
         '7 new readings were rejected. The last one, 162.5 MPa, is impossible '
         '(believed: 0.05 to 40 MPa). '
-        'Is main_steam_pressure_unit kPa or bar or psi rather than MPa?'
+        "It would be possible in bar: set main_steam_pressure_unit to 'bar'."
     )
     scene.says(Level.OK, 'Hz', 'main_steam_pressure')
 
@@ -272,14 +303,21 @@ def test_the_value_is_named_as_it_was_sent() -> None:
     scene.says(Level.WARN, 'The last one, 65 fraction, is impossible')
     scene.counts['valve_opening']['impossible'] = 2
     scene.health.note('valve_opening', [(1, Signal.VALVE_OPENING, 6500.0, 0)])
-    scene.says(Level.WARN, 'Is valve_opening_unit percent rather than fraction?')
+    scene.says(Level.WARN, "possible in %: set valve_opening_unit to 'percent'.")
 
 
 def test_a_stamped_value_has_no_other_unit() -> None:
-    scene = Scene(valve_opening_unit='fraction')
-    scene.health.note(PLANT_SAMPLE, [(1, Signal.VALVE_OPENING, 650.0, 0)])
-    scene.counts['valve_opening']['impossible'] = 1
-    scene.says(Level.WARN, 'The last one, 650 %, is impossible (believed: -2 to 105 %).')
+    scene = Scene(valve_opening_unit='fraction', main_steam_pressure_unit='bar')
+    scene.statistics = {name: TopicStatistics() for name in TOPICS}
+    scene.hear(PLANT_SAMPLE)
+    for topic, signal, value, words in (
+        ('valve_opening', Signal.VALVE_OPENING, 650.0, '650 %, is impossible (believed: -2 to'),
+        ('main_steam_pressure', Signal.MAIN_STEAM_PRESSURE, 124.86,
+         'It would be possible in bar: convert to MPa before sending.'),
+    ):  # fmt: skip
+        scene.health.note(PLANT_SAMPLE, [(1, signal, value, 0)])
+        scene.counts[topic]['impossible'] = 1
+        scene.says(Level.WARN, words, topic)
 
 
 @pytest.mark.parametrize(
@@ -293,7 +331,27 @@ def test_a_stamped_value_has_no_other_unit() -> None:
 def test_other_rejections_are_told_by_reason(reason: str, words: str) -> None:
     scene = Scene()
     scene.counts['valve_opening'][reason] = 4
-    scene.says(Level.WARN, f'4 new readings were rejected. So far: {words}.')
+    scene.says(Level.WARN, f'4 new readings were rejected. In all runs so far: {words}.')
+
+
+def test_bad_quality_is_told() -> None:
+    scene = Scene()
+    scene.counts['valve_opening']['bad_quality'] = 4
+    scene.says(
+        Level.WARN,
+        '4 new readings were rejected. The sender marked them as bad quality, or does not set '
+        'valve_opening_quality, which is then 0, unknown; 1 is good.',
+    )
+
+
+def test_what_was_rejected_in_an_earlier_run_is_no_news() -> None:
+    scene = Scene()
+    counts = scene.counts['valve_opening']
+    counts['impossible'], counts['bad_quality'] = 40, 4
+    scene.health.begin(scene.counts)
+    scene.says(Level.OK, '1 Hz.')
+    counts['impossible'] += 1
+    scene.says(Level.WARN, '1 new readings were rejected. In all runs so far: bad quality 4,')
 
 
 def test_a_topic_without_any_time_points_to_the_clock() -> None:
@@ -308,7 +366,7 @@ def test_a_topic_without_any_time_points_to_the_clock() -> None:
 def test_the_message_follows_rep_107() -> None:
     items = [
         Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
-        Item('recorder', Level.ERROR, 'Broken.', {'On': False}),
+        Item('recorder', Level.ERROR, 'Broken.', {'On': False, 'Shift (MW)': math.nan}),
     ]
     message = diagnostics_message(items, 'unit_1/monitor', 'HV101', 5 * 10**9)
     assert message.header.stamp.sec == 5
@@ -321,7 +379,7 @@ def test_the_message_follows_rep_107() -> None:
     )
     assert [(v.key, v.value) for v in first.values] == [('Rate (Hz)', '1'), ('Age (s)', 'unknown')]
     assert second.level == DiagnosticStatus.ERROR
-    assert second.values[0].value == 'no'
+    assert [v.value for v in second.values] == ['no', 'unknown']
     for level in Level:
         assert bytes([level]) == getattr(DiagnosticStatus, level.name)
 
@@ -380,6 +438,17 @@ def said_of(monitor: Monitor, notes: tuple[str, ...], identifiable: bool = True)
     return item
 
 
+def test_what_is_not_learnt_yet_is_unknown(monitor: Monitor) -> None:
+    names = [
+        'Noise of the integrated input (% MPa^e)',
+        'Noise of the power (MW)',
+        'Temperature spread (K)',
+    ]
+    before, since = (fit_item(made, WORKER, None).values for made in (Monitor(WORK), monitor))
+    assert [before[name] for name in names] == [None] * 3
+    assert None not in [since[name] for name in names]
+
+
 def test_a_weak_curve_says_so(monitor: Monitor) -> None:
     assert said_of(monitor, ()).level == Level.OK
     assert said_of(monitor, ('Manual step test: 19 of 19 levels count.',)).level == Level.OK
@@ -432,7 +501,7 @@ def test_diagnostics_tell_the_state_that_no_announcement_told() -> None:
     item = after([2.0, 0.0] * 5 + [2.0])
     assert (item.level, item.values['State']) == (Level.ERROR, 'unacknowledged')
     assert (
-        item.values['Occurrences'],
+        item.values['Occurrences in all runs'],
         item.values['Announcements suppressed by alarm_flood'],
     ) == (6, 4)
 

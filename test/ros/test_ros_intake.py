@@ -12,7 +12,13 @@ from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.ros.decoding import INPUT_ORDER, PLANT_SAMPLE, Decoder, header_time_ns
+from valveflow_ros.ros.decoding import (
+    INPUT_ORDER,
+    PLANT_SAMPLE,
+    Decoder,
+    header_time_ns,
+    sample_warnings,
+)
 from valveflow_ros.ros.encoding import clock_bytes, encode, float64_bytes, to_time
 from valveflow_ros.ros.node.intake import (
     LONGEST_WAIT_S,
@@ -328,6 +334,24 @@ def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
     assert by_signal[Signal.MAIN_STEAM_PRESSURE][3] == Quality.UNCERTAIN
     assert by_signal[Signal.MAIN_STEAM_TEMPERATURE][3] == Quality.BAD
     assert math.isnan(by_signal[Signal.GENERATED_POWER][2])
+
+
+def test_parameters_that_do_not_agree_with_a_sample_are_told() -> None:
+    given = {'main_steam_pressure_unit': 'bar', 'valve_command_unit': 'fraction', 'unit_tag': 'U1'}
+    message = sample(T0)
+    message.header.frame_id = 'U2'
+    assert sample_warnings(encode(message), Settings(given)) == [
+        'main_steam_pressure_unit bar does not apply to PlantSample, which is taken in MPa.',
+        "PlantSample has the frame_id 'U2', but unit_tag is 'U1'. Check that the samples are of "
+        'this unit.',
+    ]
+    # The command may come on its own topic, in its unit.
+    message = sample(T0, valve_command=50.0)
+    assert sample_warnings(encode(message), Settings(given))[1].startswith('valve_command_unit')
+    message = sample(T0)
+    message.header.frame_id = 'U1'
+    fitting = Settings({'unit_tag': 'U1', 'generated_power_unit': 't/h'})
+    assert sample_warnings(encode(message), fitting) == []
 
 
 def test_a_command_that_is_not_sent_is_no_reading() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -25,9 +26,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import wait_until
-from std_msgs.msg import Float32, Float64
+from std_msgs.msg import Float32, Float64, Header
 from std_srvs.srv import Trigger
-from valveflow_msgs.msg import FlowCharacteristic
+from valveflow_msgs.msg import FlowCharacteristic, PlantSample
 
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
@@ -37,7 +38,7 @@ from valveflow_ros.ros import demo, replay_main, simulator_main, watch_main
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.engine import example_curve
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.node.recording import check_record_directory
+from valveflow_ros.ros.node.recording import check_record_directory, new_folder
 from valveflow_ros.ros.outputs import OUTPUTS
 
 pytestmark = pytest.mark.ros
@@ -160,6 +161,29 @@ def test_the_quality_of_service_is_set_from_outside_and_recorded_as_offered(
     (diagnosis,) = offered['/valveflow_monitor/diagnosis']
     assert (diagnosis['depth'], diagnosis['durability']) == (7, 'transient_local')
     assert offered['/valveflow_monitor/alarms'][0]['depth'] == OUTPUTS['alarms'].kept
+
+
+def test_a_sample_that_does_not_agree_with_the_parameters_is_told_once(
+    context: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(context, tmp_path, main_steam_pressure_unit='bar')
+    told: list[str] = []
+    monkeypatch.setattr(stage.monitor, '_log', lambda _, text: told.append(text))
+    try:
+        stage.monitor.trigger_configure()
+        stage.monitor.trigger_activate()
+        publisher = stage.other.create_publisher(PlantSample, '/plant_sample', 10)
+        wait_until(lambda: publisher.get_subscription_count(), 'the subscription', 20.0)
+        for second in (1, 2):
+            header = Header(stamp=Time(sec=second), frame_id='U2')
+            publisher.publish(PlantSample(header=header))
+            wait_until(lambda: stage.monitor.step(), 'the message', 20.0)
+    finally:
+        stage.close()
+    assert [text.split(' ')[0] for text in told if 'PlantSample' in text] == [
+        'main_steam_pressure_unit',
+        'PlantSample',
+    ]
 
 
 @pytest.mark.parametrize(
@@ -417,6 +441,18 @@ def test_a_folder_that_will_do_is_left_as_it_is(tmp_path: Path) -> None:
     check_record_directory(recorded_to(tmp_path))
     check_record_directory(recorded_to(tmp_path / 'a' / 'b'))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_is_named_by_its_absolute_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for given in ('', 'valveflow_recordings'):
+        folder = new_folder(recorded_to(given), 1.7e9)
+        assert folder.parent == tmp_path / 'valveflow_recordings'
+    monkeypatch.setattr(os, 'access', lambda *_: False)
+    with pytest.raises(RecordingError, match=f'^{tmp_path}/records: cannot be made'):
+        check_record_directory(recorded_to('records'))
 
 
 def test_a_folder_that_cannot_be_recorded_into_is_refused(

@@ -128,6 +128,7 @@ def test_who_comes_late_finds_everything_with_a_time(
             assert from_time(message.header.stamp) == output.time_ns
     told = [deserialize_message(o.data, Alarm) for o in first if o.name == 'alarms']
     assert {alarm.name for alarm in told} == {'residual', 'curve_shift'}
+    assert {alarm.sentence for alarm in told} == {'The alarm was not raised since the start.'}
     assert {(a.state, a.previous_state, a.occurrence) for a in told} == {
         (Alarm.NORMAL,) * 2 + (0,)
     }

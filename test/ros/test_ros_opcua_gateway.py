@@ -140,7 +140,7 @@ def test_samples_of_two_units_health_and_an_outage(processes, hearing, server, t
     server.set('power', 'text', kind='String')
     hearing.until_quality('/u1', PlantSample.QUALITY_BAD)
     hearing.until_told(power, '1 wrong_type')
-    assert (hearing.values[power]['value (MW)'], hearing.values[power]['status']) == ('nan', 'bad')
+    assert [hearing.values[power][k] for k in ('value (MW)', 'status')] == ['unknown', 'bad']
     server.kill()
     hearing.until_told('u1/opcua_gateway: link', 'nobody listens there')
     hearing.until_quality('/u1', PlantSample.QUALITY_BAD, 'main_steam_pressure')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -208,10 +209,10 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
     overrides = [ros('refit_periodd', 30.0), ros('use_sim_time', False), ros('record', False)]
     node = MonitorNode(context=context, parameter_overrides=overrides)
     (sentence,) = unknown_overrides(node)
-    assert sentence == "Parameter 'refit_periodd' does not exist, did you mean 'refit_period'."
+    assert sentence == "Parameter 'refit_periodd' does not exist; did you mean 'refit_period'?"
     (item,) = node.unknown_parameters()
     assert (item.name, item.level) == ('parameters', Level.WARN)
-    assert item.sentence == f'{sentence} Ignored.'
+    assert item.sentence == f'{sentence} It is ignored.'
     node.destroy_node()
 
 
@@ -346,6 +347,11 @@ def test_from_afar_nothing_hostile_gets_in(context: Any, running: MonitorNode, k
         ('/**:\n  ros__parameters:\n    refit_period: -5.0\n', "Parameter 'refit_period' must be"),
         ('/**:\n  ros__parameters:\n    refit_period: soon\n', "Parameter 'refit_period' must be"),
         ('/**:\n  ros__parameters:\n    refit_period: .nan\n', "Parameter 'refit_period' must be"),
+        (
+            '/**:\n  ros__parameters:\n    unit_tag: 7\n',
+            "Parameter 'unit_tag' must be a text, not 7; write unit_tag: '7' in a file, "
+            '-p unit_tag:="\'7\'" on a command line.',
+        ),
         ('/**:\n  ros__parameters: [\n', 'ROS could not be started'),
     ],
 )
@@ -358,6 +364,13 @@ def test_a_bad_parameter_file_is_one_sentence_and_status_1(
     said = capfd.readouterr().err
     assert words in said
     assert said.count('valveflow monitor:') == 1
+
+
+def test_a_text_of_digits_is_given_as_the_refusal_of_a_number_says(context: Any) -> None:
+    written = shlex.split('''--ros-args -p unit_tag:="'7'"''')
+    node = MonitorNode(context=context, cli_args=written)
+    assert node.settings.text('unit_tag') == '7'
+    node.destroy_node()
 
 
 def test_the_parameter_file_is_the_table() -> None:

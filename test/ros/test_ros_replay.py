@@ -113,7 +113,10 @@ def test_a_log_is_heard_again_as_it_stands_with_its_times_on_the_clock(
         (['missing.mcap'], 'missing.mcap: cannot be opened (no such file or directory).', 1),
         (['missing.mcap', '--verify'], 'missing.mcap: cannot be opened', 1),
         (['text.mcap'], 'text.mcap: is not an MCAP file.', 1),
+        (['runs'], 'give one of: runs/one, runs/two.', 1),
+        (['runs', '--verify'], 'give one of: runs/one, runs/two.', 1),
         (['plain.mcap', '--verify'], 'is no recording of the monitor', 1),
+        (['plain.mcap', '--verify'], 'The progress is printed from time to time.', 1),
         (['plain.mcap', '--rate', '-1'], 'from 0 to 1000000', 2),
         (['plain.mcap', '--wait', '0.2'], 'Nobody listened within 0.2 s', 1),
     ],
@@ -129,6 +132,9 @@ def test_what_cannot_be_done_is_said_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'text.mcap').write_text('This is a letter to my grandmother.\n' * 20)
     write_samples(TABLE, tmp_path / 'plain.mcap')
+    for name in ('one', 'two'):
+        (tmp_path / 'runs' / name).mkdir(parents=True)
+        (tmp_path / 'runs' / name / 'log_0.mcap').touch()
     try:
         found = replay_main.main(arguments)
     except SystemExit as error:

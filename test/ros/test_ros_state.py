@@ -660,7 +660,7 @@ def test_a_damaged_state_is_seen_in_the_health_until_the_next_start(tmp_path: Pa
     written(tmp_path)
     path = tmp_path / 'state_unit' / STATE
     path.write_bytes(path.read_bytes()[:-1])
-    for level, words in ((Level.WARN, 'is not used.'), (Level.OK, 'is saved in its time.')):
+    for level, words in ((Level.WARN, 'is not used.'), (Level.OK, 'is saved regularly.')):
         store = StateStore(settings(tmp_path))
         item = store.item()
         assert item.level == level

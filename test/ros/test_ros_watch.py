@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, Prediction
 from valveflow_msgs.srv import OperateAlarm
 
+from valveflow_ros.report.terminal.board import CURVE, HEALTH
 from valveflow_ros.report.terminal.screen import screen
 from valveflow_ros.ros import watch_main
 from valveflow_ros.ros.listening import fields_of
@@ -58,12 +59,15 @@ class Speaker(Node):
         publisher.publish(message)
         return publisher
 
-    def go_on(self) -> None:
-        """Say what comes again and again."""
+    def say_health(self) -> None:
         self.health.publish(diagnostics_message(
             [Item('input valve_opening', Level.STALE, 'silent for 9 s.'),
              Item('recorder', Level.OK, 'Recording.')], 'monitor', 'U1', AT_S * 10**9,
         ))  # fmt: skip
+
+    def go_on(self) -> None:
+        """Say what comes again and again."""
+        self.say_health()
         self.predictions.publish(
             Prediction(
                 header=self.head, state=2, integrated_input=1500.0, measured_mw=220.0,
@@ -147,6 +151,39 @@ def test_one_picture_of_a_real_process(speaker, processes):
     frame = json.loads(processes.output(process))
     assert frame['curve']['breakpoints'] == [1000.0, 2000.0]
     assert frame['recorder']['sentence'] == 'Recording.'
+
+
+@pytest.mark.parametrize('sends', [True, False])
+def test_one_picture_waits_for_a_sample_or_says_that_none_came(
+    speaker, watch, capsys, monkeypatch, sends
+):
+    monkeypatch.setattr(watch_main.time, 'time_ns', lambda: (AT_S + 90) * 10**9)
+    executor = SingleThreadedExecutor(context=speaker.context)
+    executor.add_node(watch)
+
+    def found():
+        watch.look()
+        return watch.monitor
+
+    def latched():
+        speaker.say_health()
+        executor.spin_once(timeout_sec=0.05)
+        return {CURVE, HEALTH} <= watch.heard
+
+    wait_until(found, 'the monitor')
+    wait_until(latched, 'what comes before the first sample')
+    if sends:
+        speaker.create_timer(0.2, speaker.go_on)
+        executor.add_node(speaker)
+    assert watch_main._once(watch, executor, True, None) == 0
+    frame = json.loads(capsys.readouterr().out)
+    executor.shutdown()
+    if sends:
+        assert (frame['note'], frame['last']['residual_mw']) == ('', 1.5)
+    else:
+        assert frame['last'] is None
+        assert frame['note'].startswith('No sample was received within 3 s.')
+        assert frame['note'].endswith('The newest message shown is 1 min 30 s old.')
 
 
 @pytest.mark.parametrize(('success', 'status'), [(True, 0), (False, 1)])

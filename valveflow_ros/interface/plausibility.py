@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -15,16 +14,8 @@ from valveflow_ros.logs.tables.match import choosing, option
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError
 from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.records import FLOW_UNITS, SIGNALS, FloatArray, Quality, Readings, Signal
-from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, unit_of
+from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, better_units, unit_of
 
-# Usual ranges of the signals of a steam unit in operation, in engine units.
-_USUAL = {
-    Signal.VALVE_OPENING: (3.0, 102.0),
-    Signal.MAIN_STEAM_PRESSURE: (2.0, 35.0),
-    Signal.MAIN_STEAM_TEMPERATURE: (350.0, 680.0),
-    Signal.GENERATED_POWER: (3.0, 1800.0),
-    Signal.VALVE_COMMAND: (3.0, 102.0),
-}
 # A pressure must be positive; the temperature is absolute zero.
 _LEAST_MPA, _COLDEST_DEGC = 1e-6, -273.15
 _MANY = 0.02  # fraction of impossible values that is reported
@@ -118,7 +109,7 @@ def doubt(
     taken = unit_of(signal, unit)
     values = written * taken.scale + taken.offset
     impossible = float(((values < low) | (values > high)).mean())
-    fitting = _better_units(signal, written, unit, (low, high)) if steam else ()
+    fitting = better_units(signal, written, unit, (low, high)) if steam else ()
     looks_like = fitting[0] if fitting else ''
     if impossible < _MANY and not looks_like:
         return None
@@ -135,33 +126,6 @@ def doubt(
     if looks_like:
         sentence += f' They look like {" or ".join(fitting)}.'
     return Doubt(signal, impossible, looks_like, sentence, fitting[1:])
-
-
-def _better_units(
-    signal: Signal, written: FloatArray, unit: str, allowed: tuple[float, float]
-) -> tuple[str, ...]:
-    """Return units in which the values would be usual, if they are unusual in their own unit."""
-    middle = float(np.median(written))
-    low, high = _USUAL[signal]
-
-    def middle_in(name: str) -> float:
-        return middle * unit_of(signal, name).scale + unit_of(signal, name).offset
-
-    def usual(name: str) -> bool:
-        other = unit_of(signal, name)
-        values = written * other.scale + other.offset
-        inside = (values >= allowed[0]) & (values <= allowed[1])
-        return low <= middle_in(name) <= high and bool(inside.mean() > 0.95)
-
-    own = unit_of(signal, unit)
-    if usual(unit):
-        return ()
-    # If two units are equal, keep the first.
-    others = {other: name for name, other in reversed(UNITS[signal].items()) if other != own}
-    return tuple(sorted(
-        (name for name in reversed(others.values()) if usual(name)),
-        key=lambda name: abs(math.log(middle_in(name) ** 2 / (low * high))),
-    ))  # fmt: skip
 
 
 def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:

@@ -28,6 +28,8 @@ from valveflow_ros.logs.tables.table import open_table
 
 MAX_METADATA_BYTES = 16 << 20
 BAG_SUFFIX = '.db3'
+# A sentence names so many recordings.
+_MOST_NAMED = 10
 TABLE_SUFFIXES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx', '.xlsm')
 
 
@@ -94,7 +96,10 @@ def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
         bags = sorted(folder / name for name in names if name.endswith(BAG_SUFFIX))
         if bags:
             return bags, []
-        raise RecordingError(folder, 'has no .mcap file in it, and no .db3')
+        problem = 'has no .mcap file in it, and no .db3'
+        if inside := _recordings_in(folder):
+            problem += f'; give one of: {inside}'
+        raise RecordingError(folder, problem)
     missing = [name for name in listed if name not in whole]
     warnings = [f"'{name}' is named in {METADATA_NAME} and is not there." for name in missing]
     if not listed:
@@ -108,6 +113,16 @@ def _files_of(folder: Path) -> tuple[list[Path], list[str]]:
     elif others:
         warnings.append(f'{METADATA_NAME} names none of the files that are there; all are read.')
     return own or found, warnings
+
+
+def _recordings_in(folder: Path) -> str:
+    """Return the folders in a folder that hold recordings, as a list for a sentence."""
+    with os_errors(folder, 'cannot be read'):
+        inner = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+        found = [str(path) for path in inner if any((*path.glob('*.mcap*'), *path.glob('*.db3')))]
+    # By their names the newest of the monitor's come last.
+    more = f'{len(found) - _MOST_NAMED} earlier ones, ' if len(found) > _MOST_NAMED else ''
+    return more + ', '.join(found[-_MOST_NAMED:])
 
 
 def _stem(name: str) -> str:

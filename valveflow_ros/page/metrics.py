@@ -169,7 +169,7 @@ def _counts(units: Named) -> Iterator[Metric]:
         yield counter
     samples = CounterMetricFamily('valveflow_samples', 'Samples judged.', labels=['unit'])
     for name, unit in units:
-        value = _number(unit, 'fit', 'Samples taken')
+        value = _number(unit, 'fit', 'Samples taken in all runs')
         if math.isfinite(value):
             samples.add_metric([name], value)
     yield samples

@@ -90,8 +90,12 @@ def stands(node: Node, wanted: RosParameter) -> bool:
 
 def _checked(row: Parameter, value: object) -> Value:
     if isinstance(row.default, str) and isinstance(value, int | float):
-        hint = 'put it in quotes, and those in quotes once more on a command line'
-        raise ParameterError(row.name, f'must be a text, not {value!r}: {hint}')
+        in_file, in_shell = f"{row.name}: '{value}'", f'-p {row.name}:="\'{value}\'"'
+        raise ParameterError(
+            row.name,
+            f'must be a text, not {value!r}; write {in_file} in a file, '
+            f'{in_shell} on a command line',
+        )
     return row.check(value)
 
 

@@ -19,7 +19,7 @@ from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.signals.units import UNITS, Unit, unit_of
+from valveflow_ros.signals.units import Unit, unit_of
 
 Row = tuple[int, int, float, int]
 """A reading as ``(time_ns, signal, value, quality)``, as `Readings.of` takes it."""
@@ -177,6 +177,33 @@ def _sample_reader(quality: Sequence[int]) -> Callable[[bytes, int], list[Row]]:
     return read
 
 
+def sample_warnings(data: bytes, settings: Settings) -> list[str]:
+    """Return what in a PlantSample does not agree with the parameters.
+
+    Raises
+    ------
+    ValueError
+        The bytes are no PlantSample.
+    """
+    sample, found = _sample(data), []
+    for info in SIGNALS:
+        name, code = f'{info.topic}_unit', getattr(sample, f'{info.topic}_quality')
+        named = settings.text(name)
+        sent = info.required or code != PlantSample.QUALITY_UNKNOWN
+        if sent and unit_of(info.signal, named) != unit_of(info.signal, info.unit):
+            found.append(
+                f'{name} {named} does not apply to PlantSample, which is taken in {info.unit}.'
+            )
+    tag, frame_id = settings.text('unit_tag'), sample.header.frame_id
+    # Left empty, it names no unit.
+    if frame_id not in ('', tag):
+        found.append(
+            f"PlantSample has the frame_id '{frame_id}', but unit_tag is '{tag}'. Check that the "
+            'samples are of this unit.'
+        )
+    return found
+
+
 def with_todays_codes(data: bytes) -> bytes:
     """Convert a PlantSample with earlier quality codes (0 is good) to the current codes.
 
@@ -190,13 +217,6 @@ def with_todays_codes(data: bytes) -> bytes:
         name = f'{info.topic}_quality'
         setattr(sample, name, min(getattr(sample, name) + 1, PlantSample.QUALITY_BAD))
     return serialize_message(sample)
-
-
-def plausible_units(signal: Signal, settings: Settings, sent: float) -> list[str]:
-    """Return the units in which ``sent`` would be a plausible value of ``signal``."""
-    low, high = plausible_range(signal, settings)
-    named = {unit: name for name, unit in UNITS[signal].items()}  # each unit once
-    return [name for unit, name in named.items() if low <= sent * unit.scale + unit.offset <= high]
 
 
 def plausible_range(signal: Signal, settings: Settings) -> tuple[float, float]:

@@ -300,7 +300,7 @@ class Watch(Node):
             for status in message.status
         }
         if 'fit' in values:
-            self.samples = int(values['fit'].get('Samples taken', '0'))
+            self.samples = int(values['fit'].get('Samples taken in all runs', '0'))
             self._story.reached(DEFAULT_START_NS + self.samples * NS_PER_S)
         refitting = values.get('fit', {}).get('Refit under way for (s)', 'unknown') != 'unknown'
         self.busy = refitting or values.get('diagnosis', {}).get('Running') == 'yes'

@@ -89,7 +89,7 @@ def _never(name: str, time_ns: int) -> AlarmChange:
     normal = AlarmState.NORMAL
     return AlarmChange(
         time_ns, name, normal, normal, Priority.MEDIUM, math.nan, math.nan, '',
-        'It has not come since the start.', 0, 0, '',
+        'The alarm was not raised since the start.', 0, 0, '',
     )  # fmt: skip
 
 

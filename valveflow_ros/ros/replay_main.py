@@ -168,7 +168,7 @@ def _verify(path: str) -> int:
         # Progress lines are rare, and the first one comes after a while.
         print(
             f'Verifying {path}: its inputs are fed to the engine again, and every recorded output '
-            'is compared byte for byte. How far it is will be told now and then.',
+            'is compared byte for byte. The progress is printed from time to time.',
             file=sys.stderr, flush=True,
         )  # fmt: skip
     progress = Progress(sys.stderr, bar)

@@ -22,11 +22,12 @@ from std_srvs.srv import Trigger
 from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import ValveflowError
-from valveflow_ros.records import zone_of
-from valveflow_ros.report.terminal.board import CURVE, HEALTH, Board
+from valveflow_ros.records import NS_PER_S, zone_of
+from valveflow_ros.report.terminal.board import CURVE, HEALTH, PREDICTION, Board
 from valveflow_ros.report.terminal.frame import Frame
 from valveflow_ros.report.terminal.screen import Screen
 from valveflow_ros.report.terminal.text import number, zone_argument
+from valveflow_ros.report.words import duration
 from valveflow_ros.ros.domain import start_ros
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
 from valveflow_ros.ros.outputs import SERVICES
@@ -214,16 +215,28 @@ def _once(
     if not _find(node, executor):
         return complain('watch', node.frame().note)
     found_s = time.monotonic()
-    # Health is published once a second; latched messages arrive at once.
-    while not {CURVE, HEALTH} <= node.heard and time.monotonic() - found_s < _HEAR_S:
+    # Health and samples are published once a second; latched messages arrive at once.
+    wanted = {CURVE, HEALTH, PREDICTION}
+    while not wanted <= node.heard and time.monotonic() - found_s < _HEAR_S:
         _listen(node, executor, 0.1)
     frame = node.frame()
+    if frame.last is None and not frame.note:
+        frame = dataclasses.replace(frame, note=_no_sample(frame.now_ns))
     if as_json:
         content = _finite(dataclasses.asdict(frame))
         print(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
     else:
         print(Screen(sys.stdout, zone=zone).text(frame), flush=True)
     return 0
+
+
+def _no_sample(shown_ns: int) -> str:
+    """Return what to say of a picture whose time is that of an older message."""
+    told = f'No sample was received within {_HEAR_S:g} s.'
+    age_ns = time.time_ns() - shown_ns
+    if shown_ns and age_ns >= 0:
+        told += f' The newest message shown is {duration(age_ns / NS_PER_S)} old.'
+    return told
 
 
 def _finite(value: Any) -> Any:

@@ -43,7 +43,7 @@ from valveflow_ros.records import (
 REASONS = (
     'accepted',  # used for the table
     'not_finite',  # NaN or infinite
-    'bad_quality',  # marked as bad or without a quality by the sender
+    'bad_quality',  # the sender marked it as bad quality, or set no quality
     'impossible',  # outside the plausible range of its signal
     'duplicate',  # same stamp as the previous one
     'out_of_order',  # older than the newest of its own signal

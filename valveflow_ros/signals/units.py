@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 
@@ -68,6 +69,15 @@ FURTHER[Signal.GENERATED_POWER] |= dict.fromkeys(FLOW_UNITS, Unit(1.0))
 # instrument makers ('psid').
 DIFFERENCES = {f'{name}d': unit for name, unit in _PRESSURE.items()} | {'mbard': Unit(1e-4)}
 FURTHER[Signal.MAIN_STEAM_PRESSURE] |= DIFFERENCES
+
+# What the signals of a steam unit in operation usually read, in engine units.
+_USUAL = {
+    Signal.VALVE_OPENING: (3.0, 102.0),
+    Signal.MAIN_STEAM_PRESSURE: (2.0, 35.0),
+    Signal.MAIN_STEAM_TEMPERATURE: (350.0, 680.0),
+    Signal.GENERATED_POWER: (3.0, 1800.0),
+    Signal.VALVE_COMMAND: (3.0, 102.0),
+}
 
 
 def engine_unit(signal: Signal, name: str) -> str:
@@ -140,3 +150,41 @@ def convert(signal: Signal, name: str, values: FloatArray) -> FloatArray:
     """Convert ``values`` from the unit ``name`` to the engine's unit."""
     unit = unit_of(signal, name)
     return np.asarray(values, dtype=np.float64) * unit.scale + unit.offset
+
+
+def better_units(
+    signal: Signal, written: FloatArray, unit: str, allowed: tuple[float, float]
+) -> tuple[str, ...]:
+    """Return the units in which the values would be usual when in their own they are not.
+
+    Parameters
+    ----------
+    signal : Signal
+    written : float64 (n,)
+        Finite values as they were sent.
+    unit : str
+        The unit they are taken to have.
+    allowed : tuple of float
+        Lowest and highest possible value, in the engine's unit.
+    """
+    middle = float(np.median(written))
+    low, high = _USUAL[signal]
+
+    def middle_in(name: str) -> float:
+        return middle * unit_of(signal, name).scale + unit_of(signal, name).offset
+
+    def usual(name: str) -> bool:
+        other = unit_of(signal, name)
+        values = written * other.scale + other.offset
+        inside = (values >= allowed[0]) & (values <= allowed[1])
+        return low <= middle_in(name) <= high and bool(inside.mean() > 0.95)
+
+    own = unit_of(signal, unit)
+    if usual(unit):
+        return ()
+    # Of two names of one unit the first.
+    others = {other: name for name, other in reversed(UNITS[signal].items()) if other != own}
+    return tuple(sorted(
+        (name for name in reversed(others.values()) if usual(name)),
+        key=lambda name: abs(math.log(middle_in(name) ** 2 / (low * high))),
+    ))  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from valveflow_ros.cli.command import Console, VerbResult, time_ns
-from valveflow_ros.errors import InputError, UsageError
+from valveflow_ros.errors import InputError, UsageError, listed
 from valveflow_ros.interface.files import check_log
 from valveflow_ros.report.terminal.text import number, whole
 
@@ -105,7 +105,19 @@ def run(options: Namespace, console: Console) -> VerbResult:
     console(0.6, 'writing')
     log = found.write(options.output, truth=options.truth, overwrite=options.overwrite)
     data = {'log': str(log), 'rows': len(found.data), **found.to_json()}
-    return VerbResult(_text(found, log, options.truth), data)
+    wrote = f'Wrote {listed(_written(log, options.truth))}.'
+    return VerbResult(wrote if options.quiet else f'{_text(found)}\n{wrote}', data)
+
+
+def _written(log: Path, truth: Path | None) -> list[str]:
+    """Return the files that were written; a recording has a metadata.yaml beside it."""
+    from valveflow_ros.logs.mcap.folder import METADATA_NAME
+    from valveflow_ros.logs.mcap.importing import tells_of
+
+    beside = log.with_name(METADATA_NAME)
+    # That of another recording stays as it is.
+    found = [log, *([beside] if beside.is_file() and tells_of(beside, log.name) else [])]
+    return [str(path) for path in (*found, *([truth] if truth else []))]
 
 
 def _catalogue(unit: str) -> VerbResult:
@@ -129,7 +141,7 @@ def _catalogue(unit: str) -> VerbResult:
     return VerbResult('\n\n'.join(describe(e) for e in effects), data)
 
 
-def _text(found: Simulation, written: Path, truth: Path | None) -> str:
+def _text(found: Simulation) -> str:
     from valveflow_ros.plant.thermal_plant import ThermalLog
     from valveflow_ros.report.words import count, duration
 
@@ -141,7 +153,6 @@ def _text(found: Simulation, written: Path, truth: Path | None) -> str:
     else:
         lines = [f'{begin}, one every {duration(log.unit.sample_period_s)}.', *_paper_lines(log)]
     lines += [f'  effect   {effect}' for effect in log.active] or ['  effects  none']
-    lines.append(f'Wrote {written}' + (f' and {truth}' if truth else '') + '.')
     return '\n'.join(lines)
 
 

@@ -163,7 +163,7 @@ def write_readings(
             split = finish_split(file, target.name, book.table)
         path = target.parent / METADATA_NAME
         # A single file needs no metadata.yaml, so that of another recording is kept.
-        if not path.exists() or _tells_of(path, target.name):
+        if not path.exists() or tells_of(path, target.name):
             write_metadata(target.parent, [split])
     return WrittenLog(target, records.count)
 
@@ -228,7 +228,7 @@ def strictly_increasing(times: IntArray) -> IntArray:
     return np.maximum.accumulate(times - steps) + steps
 
 
-def _tells_of(path: Path, name: str) -> bool:
+def tells_of(path: Path, name: str) -> bool:
     """Return True if a `metadata.yaml` describes this file only."""
     try:
         top = yaml.safe_load(path.read_text(encoding='utf-8'))

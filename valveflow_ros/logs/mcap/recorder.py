@@ -23,7 +23,7 @@ from valveflow_ros.logs.mcap.folder import is_split_of
 from valveflow_ros.logs.mcap.records import LayoutError
 from valveflow_ros.logs.mcap.recover import RecoveryReport, recover_leftovers
 from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, Qos, RecordingWriter
-from valveflow_ros.logs.part_file import PartFile, make_folder
+from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder
 from valveflow_ros.logs.source import os_errors
 
 # The state reports drops for this long, so that a reader that polls once a second sees them.
@@ -92,7 +92,7 @@ class RecorderStatus:
     reason : str
         Why it is not recording; empty if it is.
     file : str
-        Name of the current split; empty if none.
+        Name of the current split on disk; empty if none.
     received : int
         Messages passed to the recorder.
     written : int
@@ -187,7 +187,8 @@ class RecorderCounters:
             now.lost += writer.lost - self._lost_in_files
             self._lost_in_files = writer.lost
             now.queued -= now.written + now.removed + writer.lost - before
-            now.file = writer.path.name if writer.path is not None else ''
+            # As it stands on disk until it is finished.
+            now.file = f'{writer.path.name}{PART_SUFFIX}' if writer.path is not None else ''
             now.files_finished = writer.files_finished
             now.bytes_written = writer.bytes_finished + writer.file_bytes
 

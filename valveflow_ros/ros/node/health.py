@@ -10,9 +10,10 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rclpy.node import Node
 
-from valveflow_ros.errors import counted
+from valveflow_ros.errors import counted, listed
 from valveflow_ros.fit.result import weaknesses
 from valveflow_ros.logs import Qos, RecorderState
 from valveflow_ros.monitoring.alarm_state import Alarm, AlarmState
@@ -21,14 +22,14 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, SignalInfo
 from valveflow_ros.report.words import duration
-from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range, plausible_units
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range
 from valveflow_ros.ros.encoding import NOT_YET
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.ros.node.recording import Recording, recorded_qos
 from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.align import REASONS
-from valveflow_ros.signals.units import unit_of
+from valveflow_ros.signals.units import better_units, unit_of
 
 _NO_LEAD = -(2**63)
 _FAR_BEHIND_NS = 120 * NS_PER_S
@@ -104,6 +105,13 @@ class InputHealth:
         self._counted: dict[tuple[str, str], int] = {}
         self._used: dict[str, tuple[int, float]] = {}
         self._newest_ns = 0
+
+    def begin(self, counts: Mapping[str, Mapping[str, int]]) -> None:
+        """Take what became of the readings of earlier runs: it is no news."""
+        for topic, reasons in counts.items():
+            self._new(topic, 'rejected', sum(reasons[r] for r in _REJECTED))
+            for reason in ('bad_quality', 'time_outlier'):
+                self._new(topic, reason, reasons[reason])
 
     def note(self, name: str, rows: Sequence[Row]) -> None:
         """Store the stamps and the last impossible value of each signal, for the sentences."""
@@ -182,7 +190,8 @@ class InputHealth:
             'Messages sent before the first /clock': received.before_clock,
             'Messages that wait for the first /clock': received.waiting,
         }
-        return values | {f'Readings {r.replace("_", " ")}': counts[r] for r in REASONS}
+        # The engine goes on from a saved state and counts on; the intake begins anew.
+        return values | {f'Readings {r.replace("_", " ")} in all runs': counts[r] for r in REASONS}
 
     def _judge(
         self,
@@ -197,6 +206,11 @@ class InputHealth:
         rejected = self._new(info.topic, 'rejected', sum(counts[r] for r in _REJECTED))
         lost = self._new(info.topic, 'lost', received.lost)
         off, behind = self._stamps(info.signal)
+        if name == PLANT_SAMPLE and not info.required and not any(counts.values()):
+            # What is wrong with the message is told with the signals that it brings.
+            return Level.OK, (
+                f'{topic} has none, or leaves {info.topic}_quality at 0, unknown; it is optional.'
+            )
         if seen.wrong_types:
             return _wrong_type(topic, seen)
         if received.stale(now_s):
@@ -216,16 +230,15 @@ class InputHealth:
             return Level.WARN, f'{rejected} new readings were rejected. {why}'
         if received.without_time + received.waiting == received.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
-        if name == PLANT_SAMPLE and not info.required and not any(counts.values()):
-            return Level.OK, (
-                f'{topic} has none, or leaves {info.topic}_quality at 0, unknown; it is optional.'
-            )
         if off:
             return Level.WARN, off
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
         hz = received.rate_hz()
-        rate = f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
+        if hz is None:
+            rate = 'The first message has come'
+        else:
+            rate = f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
         return Level.OK, f'{rate}; {behind}.' if behind else f'{rate}.'
 
     def _judge_silent(
@@ -239,7 +252,7 @@ class InputHealth:
                 f'{topic} is published as best effort and asked for as reliable, so nothing '
                 'comes: set input_reliability, and qos_overrides if given, to best_effort.'
             )
-        if not info.required and not seen.right:
+        if not info.required:
             return Level.OK, f'{topic} is not sent; it is optional.'
         if listening_s < _PATIENCE_S:
             return Level.OK, f'Waiting for {topic}.'
@@ -261,24 +274,30 @@ class InputHealth:
                 return f'The last stamp is {off} behind the newest one used.'
             if bad_quality:
                 return (
-                    f'The sender calls them bad, or does not set {info.topic}_quality, which is '
-                    'then 0, unknown; 1 is good.'
+                    'The sender marked them as bad quality, or does not set '
+                    f'{info.topic}_quality, which is then 0, unknown; 1 is good.'
                 )
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
-            return f'So far: {", ".join(reasons)}.'
+            return f'In all runs so far: {", ".join(reasons)}.'
         name, value = found
         low, high = plausible_range(info.signal, self.settings)
-        believed = f'believed: {low:g} to {high:g} {info.unit}'
-        if name == PLANT_SAMPLE:
-            return f'The last one, {value:g} {info.unit}, is impossible ({believed}).'
-        named = self.settings.text(f'{info.topic}_unit')
+        stamped = name == PLANT_SAMPLE
+        named = info.unit if stamped else self.settings.text(f'{info.topic}_unit')
         unit = unit_of(info.signal, named)
         sent = (value - unit.offset) / unit.scale
-        text = f'The last one, {sent:g} {named}, is impossible ({believed}).'
-        fitting = [u for u in plausible_units(info.signal, self.settings, sent) if u != named]
-        if fitting:
-            text += f' Is {info.topic}_unit {" or ".join(fitting)} rather than {named}?'
-        return text
+        text = (
+            f'The last one, {sent:g} {named}, is impossible '
+            f'(believed: {low:g} to {high:g} {info.unit}).'
+        )
+        fitting = better_units(info.signal, np.array([sent]), named, (low, high))
+        if not fitting or self.settings.output_unit != 'MW':
+            return text  # what is usual is known of a steam unit only
+        suiting = listed(fitting, 'or')
+        if stamped:
+            return f'{text} It would be possible in {suiting}: convert to {named} before sending.'
+        # YAML takes a bare % for something else.
+        choices = listed([f"'{'percent' if u == '%' else u}'" for u in fitting], 'or')
+        return f'{text} It would be possible in {suiting}: set {info.topic}_unit to {choices}.'
 
     def _stamps(self, number: int) -> tuple[str, str]:
         """Return an error and a remark about the stamps since the last call, empty if none.
@@ -346,10 +365,10 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
         'Age of the curve (s)': age_s,
         'Special segments in the window': monitor.segments,
         'Special samples in the window': monitor.special_samples,
-        'Samples taken': monitor.rows,
-        'Noise of the integrated input (% MPa^e)': noise.input,
-        'Noise of the power (MW)': noise.power_mw,
-        'Temperature spread (K)': math.nan if spread_k is None else spread_k,
+        'Samples taken in all runs': monitor.rows,
+        'Noise of the integrated input (% MPa^e)': noise.input if noise.learnt else None,
+        'Noise of the power (MW)': noise.power_mw if noise.learnt else None,
+        'Temperature spread (K)': spread_k,
         'Refit under way for (s)': worker.busy_s,
         'Last refit took (s)': last_fit_s,
         'Fit process starts': worker.starts,
@@ -416,7 +435,7 @@ def _count_values(alarm: Alarm) -> dict[str, object]:
     """Return the values of an alarm that may not have been announced yet."""
     until_ns = alarm.shelved_until_ns
     return {
-        'Occurrences': alarm.occurrence,
+        'Occurrences in all runs': alarm.occurrence,
         'Announcements suppressed by alarm_flood': alarm.held,
         'Shelved until (s since 1970)': None if until_ns is None else until_ns // 10**9,
     }

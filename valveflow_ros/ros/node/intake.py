@@ -173,9 +173,9 @@ class TopicStatistics:
         """Return the age of the newest message in s; None before the first."""
         return None if self.last_s is None else now_s - self.last_s
 
-    def rate_hz(self) -> float:
-        """Return the recent mean rate in Hz; 0 while unknown."""
-        return 1.0 / self.period_s if self.period_s else 0.0
+    def rate_hz(self) -> float | None:
+        """Return the recent mean rate in Hz; None while unknown."""
+        return 1.0 / self.period_s if self.period_s else None
 
     def stale(self, now_s: float) -> bool:
         """Return True if messages were received but have stopped."""

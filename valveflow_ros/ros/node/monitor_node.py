@@ -397,7 +397,8 @@ class MonitorNode(LifecycleNode):
         if not self._ignored:
             return []
         # Also reported as health, because the user expects the parameter to have an effect.
-        sentence = f'{" ".join(self._ignored)} Ignored.'
+        ignored = 'It is ignored.' if len(self._ignored) == 1 else 'They are ignored.'
+        sentence = f'{" ".join(self._ignored)} {ignored}'
         return [Item('parameters', Level.WARN, sentence, {'Ignored': len(self._ignored)})]
 
     def same_name(self, now_s: float) -> list[Item]:

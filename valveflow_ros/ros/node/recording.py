@@ -42,9 +42,15 @@ def tag_of(settings: Settings) -> str:
 
 
 def expand_home(name: str) -> Path:
-    """Return a path with ``~`` expanded; raises `RecordingError` if the user is unknown."""
+    """Return an absolute path, with ``~`` expanded.
+
+    Raises
+    ------
+    RecordingError
+        The user after ``~`` is unknown.
+    """
     try:
-        return Path(name).expanduser()
+        return Path(name).expanduser().absolute()
     except RuntimeError:
         raise RecordingError(name, 'names the home of a user that is not there') from None
 
@@ -80,7 +86,7 @@ def check_record_directory(settings: Settings) -> None:
         return
     folder = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
     advice = 'set record_directory to a folder this user may write into, or record to false'
-    place = folder.absolute()
+    place = folder
     while not place.exists() and place != place.parent:
         place = place.parent
     if not place.is_dir():

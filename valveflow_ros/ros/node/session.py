@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +21,7 @@ from valveflow_ros.logs import Qos, RecorderStatus
 from valveflow_ros.monitoring.events import CurveAdopted, Event
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.words import in_zone
-from valveflow_ros.ros.decoding import INPUTS, Decoder
+from valveflow_ros.ros.decoding import INPUTS, PLANT_SAMPLE, Decoder, sample_warnings
 from valveflow_ros.ros.node import health, parameter_files
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, warm_up
@@ -123,6 +124,7 @@ class Session:
         self._looked_s = self._listening_since_s = 0.0
         # A state saved before the recording of an earlier run was processed would lose it.
         self._begun = False
+        self._sample_checked = False
 
     @property
     def listening(self) -> bool:
@@ -155,6 +157,7 @@ class Session:
         )  # fmt: skip
         if not self._begun:
             self._begin()
+            self._health.begin(self.engine.aligner.counts())
             self._begun = True
         self._intake = intake
         self._listening_since_s = time.monotonic()
@@ -185,8 +188,17 @@ class Session:
             self.recording.write(
                 self.inputs[arrival.name], arrival.data, arrival.log_ns, arrival.time_ns
             )
+            if arrival.name == PLANT_SAMPLE and not self._sample_checked:
+                self._check_sample(arrival.data)
         self.publish(self.engine.feed(self._intake.rows(arrivals)))
         return len(arrivals)
+
+    def _check_sample(self, data: bytes) -> None:
+        """Warn, at the first PlantSample, of parameters that do not agree with it."""
+        with contextlib.suppress(ValueError):  # counted where it is read
+            for sentence in sample_warnings(data, self._settings):
+                self._log(Level.WARN, sentence)
+            self._sample_checked = True
 
     def publish(self, events: Sequence[Event]) -> None:
         """Log, publish and record the events of a call of the engine."""
@@ -321,7 +333,7 @@ class Session:
             'topics': {**self.inputs, **self.outputs},
             'began': recording.began,
             'begun_ns': self._messages.begun_ns,
-            'recording': None if folder is None else str(folder.absolute()),
+            'recording': None if folder is None else str(folder),
         }
 
     def _send(self, outputs: Iterable[Output]) -> None:

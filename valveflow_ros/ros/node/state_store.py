@@ -404,7 +404,7 @@ class StateStore:
             # Shown until the next start, which continues this run; otherwise the loss would not
             # be noticed.
             return Item('state', Level.WARN, self.sentence, values)
-        return Item('state', Level.OK, 'The state is saved in its time.', values)
+        return Item('state', Level.OK, 'The state is saved regularly.', values)
 
     def close(self) -> None:
         """Release the folder after the pending save has finished."""
