@@ -197,5 +197,5 @@ def test_installation_ships_them():
 
 @pytest.mark.ros
 def test_the_topics_are_those_of_the_node():
-    outputs = pytest.importorskip('valveflow_ros.ros.outputs').OUTPUTS
+    outputs = pytest.importorskip('valveflow_ros.ros.node.outputs').OUTPUTS
     assert {name: outputs[name].type_name for name in TYPES} == TYPES

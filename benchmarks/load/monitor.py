@@ -25,8 +25,8 @@ from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SampleTable
 from valveflow_ros.ros.decoding import header_time_ns
 from valveflow_ros.ros.demo import ros_arguments
+from valveflow_ros.ros.node.polled_subscription import PolledSubscription
 from valveflow_ros.ros.player import Player
-from valveflow_ros.ros.polled_subscription import PolledSubscription
 from valveflow_ros.ros.simulator_main import stamped_steps
 
 NAME = '/valveflow_monitor'

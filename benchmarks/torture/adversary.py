@@ -41,7 +41,7 @@ from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import recover
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.ros.demo import ros_arguments
-from valveflow_ros.ros.outputs import OUTPUTS, SERVICES
+from valveflow_ros.ros.node.outputs import OUTPUTS, SERVICES
 from valveflow_ros.state import from_bytes
 
 RUNS = 200

@@ -23,7 +23,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable
-from valveflow_ros.ros.worker import release_memory
+from valveflow_ros.ros.node.worker import release_memory
 
 DAYS = 365
 PERIOD_DAYS = 30

@@ -19,7 +19,7 @@ from typing import Any
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.ros import monitor_main
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.polled_subscription import PolledSubscription
+from valveflow_ros.ros.node.polled_subscription import PolledSubscription
 
 HOLD, HELD = Path('hold'), Path('held')
 # The interpreter's lock cannot be given back from outside, so this one ends by itself.

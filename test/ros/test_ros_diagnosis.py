@@ -42,10 +42,10 @@ from valveflow_ros.ros.node.diagnostics import Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, example_curve, example_task
 from valveflow_ros.ros.node.health import diagnosis_item, model_item
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.outputs import Output, Outputs
+from valveflow_ros.ros.node.outputs import Output, Outputs
+from valveflow_ros.ros.node.worker import DiagnosisWorker, compute
 from valveflow_ros.ros.simulator_main import effects_of
 from valveflow_ros.ros.verify import diagnose_in_process
-from valveflow_ros.ros.worker import DiagnosisWorker, compute
 from valveflow_ros.signals.align import Aligner
 
 pytestmark = pytest.mark.usefixtures('jobs_on_path')

@@ -261,7 +261,7 @@ def test_ending_during_a_refit_finishes_the_file_at_once(
     listener.until(lambda: listener.value('fit', TAKEN) == str(samples), 'the samples')
     (worker,) = [
         child for child in psutil.Process(monitor.pid).children()
-        if any('valveflow_ros.ros.worker' in word for word in child.cmdline())
+        if any('valveflow_ros.ros.node.worker' in word for word in child.cmdline())
     ]  # fmt: skip
     # However fast the machine is, this refit is under way when the monitor has to end.
     worker.suspend()

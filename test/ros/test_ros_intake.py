@@ -29,7 +29,7 @@ from valveflow_ros.ros.node.intake import (
     LogClock,
     TopicStatistics,
 )
-from valveflow_ros.ros.polled_subscription import DEPTH, RawMessage
+from valveflow_ros.ros.node.polled_subscription import DEPTH, RawMessage
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = T0 + NS_PER_S  # later than anything was received

@@ -38,8 +38,8 @@ from valveflow_ros.ros import demo, replay_main, simulator_main, watch_main
 from valveflow_ros.ros.node import monitor_node
 from valveflow_ros.ros.node.engine import example_curve
 from valveflow_ros.ros.node.monitor_node import MonitorNode
+from valveflow_ros.ros.node.outputs import OUTPUTS
 from valveflow_ros.ros.node.recording import check_record_directory, new_folder
-from valveflow_ros.ros.outputs import OUTPUTS
 
 pytestmark = pytest.mark.ros
 _MODULES = ('monitor_main', 'simulator_main', 'replay_main', 'watch_main', 'demo')

@@ -22,9 +22,9 @@ from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
 from valveflow_ros.ros.decoding import Row, from_time
 from valveflow_ros.ros.node.engine import LiveEngine
-from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.node.worker import WorkerResult
 from valveflow_ros.ros.simulator_main import effects_of
-from valveflow_ros.ros.worker import WorkerResult
 from valveflow_ros.signals.align import Aligner
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_delay': 60.0})

@@ -13,7 +13,12 @@ from ros_helpers import wait_until
 from std_msgs.msg import Float64
 
 from valveflow_ros.ros.encoding import encode, float64_bytes
-from valveflow_ros.ros.polled_subscription import DEPTH, PolledSubscription, RawMessage, can_poll
+from valveflow_ros.ros.node.polled_subscription import (
+    DEPTH,
+    PolledSubscription,
+    RawMessage,
+    can_poll,
+)
 
 pytestmark = pytest.mark.ros
 

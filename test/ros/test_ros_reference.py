@@ -38,8 +38,8 @@ from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.ros import encoding
 from valveflow_ros.ros.decoding import from_time, journal_entry
 from valveflow_ros.ros.node.health import reference_item
+from valveflow_ros.ros.node.outputs import Outputs
 from valveflow_ros.ros.node.parameter_files import given_reference
-from valveflow_ros.ros.outputs import Outputs
 from valveflow_ros.ros.verify import verify
 from valveflow_ros.signals.static_form import OPENING
 

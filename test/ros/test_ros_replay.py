@@ -25,7 +25,7 @@ from valveflow_ros.ros import replay_main, simulator_main
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
 from valveflow_ros.ros.encoding import encode, float64_bytes
 from valveflow_ros.ros.node.intake import ClockTrack
-from valveflow_ros.ros.polled_subscription import PolledSubscription, RawMessage
+from valveflow_ros.ros.node.polled_subscription import PolledSubscription, RawMessage
 from valveflow_ros.ros.replay_main import steps_of
 from valveflow_ros.ros.simulator_main import (
     check_together,

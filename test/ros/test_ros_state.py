@@ -42,6 +42,7 @@ from valveflow_ros.ros.decoding import journal_entry
 from valveflow_ros.ros.node import restart, state_store
 from valveflow_ros.ros.node.diagnostics import Level
 from valveflow_ros.ros.node.engine import LiveEngine, example_curve
+from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.node.restart import Restart
 from valveflow_ros.ros.node.state_store import (
     ASIDE,
@@ -52,7 +53,6 @@ from valveflow_ros.ros.node.state_store import (
     StateStore,
     state_folder,
 )
-from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.signals.align import Aligner
 from valveflow_ros.state import (
     FORMAT,

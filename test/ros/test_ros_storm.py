@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from ros_helpers import Processes
 from std_srvs.srv import Trigger
 
-from valveflow_ros.ros.outputs import SERVICES
+from valveflow_ros.ros.node.outputs import SERVICES
 
 pytestmark = pytest.mark.ros
 BURSTS, OF_EACH = 3, 17

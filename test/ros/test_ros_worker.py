@@ -26,9 +26,9 @@ from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.events import DiagnosisTask
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros import worker as worker_module
+from valveflow_ros.ros.node import worker as worker_module
 from valveflow_ros.ros.node.engine import example_curve, example_task
-from valveflow_ros.ros.worker import (
+from valveflow_ros.ros.node.worker import (
     FIT_JOB,
     FitWorker,
     WorkerResult,
@@ -220,7 +220,7 @@ import threading
 import time
 from valveflow_ros.ros.node.engine import example_task
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.worker import FitWorker
+from valveflow_ros.ros.node.worker import FitWorker
 made = FitWorker(120.0, 'hurt_jobs:hangs')
 made.start()
 made.submit(example_task(Settings()))

@@ -24,7 +24,7 @@ from valveflow_msgs.msg import Prediction
 
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
 from valveflow_ros.ros.encoding import clock_bytes
-from valveflow_ros.ros.polled_subscription import PolledSubscription
+from valveflow_ros.ros.node.polled_subscription import PolledSubscription
 
 _PREDICTION = 'valveflow_msgs/msg/Prediction'
 _DEPTH = 1000

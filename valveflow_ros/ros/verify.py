@@ -27,9 +27,9 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
 from valveflow_ros.ros.decoding import Decoder, from_time, journal_entry
 from valveflow_ros.ros.node import parameter_files
+from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
-from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs
-from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker, Task, Worker
+from valveflow_ros.ros.node.worker import DiagnosisWorker, FitWorker, Task, Worker
 from valveflow_ros.signals.align import Aligner
 
 # Small, so that outputs before a decision that cannot be repeated are still compared.

@@ -30,7 +30,7 @@ from valveflow_ros.report.terminal.text import number, zone_argument
 from valveflow_ros.report.words import duration
 from valveflow_ros.ros.domain import start_ros
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
-from valveflow_ros.ros.outputs import SERVICES
+from valveflow_ros.ros.node.outputs import SERVICES
 from valveflow_ros.ros.process import Parser, complain, with_place
 
 _LOOK_S = 0.5

@@ -42,7 +42,7 @@ from valveflow_ros.records import (
 )
 from valveflow_ros.report.first_run import must_compile_to_fit
 from valveflow_ros.ros.decoding import Row
-from valveflow_ros.ros.worker import FitWorker, Worker
+from valveflow_ros.ros.node.worker import FitWorker, Worker
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.align import Aligner
 from valveflow_ros.state import State

@@ -27,7 +27,7 @@ from valveflow_ros.ros.encoding import NOT_YET
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.ros.node.recording import Recording, recorded_qos
-from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.ros.node.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.align import REASONS
 from valveflow_ros.signals.units import better_units, unit_of
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from valveflow_ros.ros.decoding import INPUT_ORDER, PLANT_SAMPLE, Decoder, Row, header_time_ns
-from valveflow_ros.ros.polled_subscription import DEPTH, RawMessage
+from valveflow_ros.ros.node.polled_subscription import DEPTH, RawMessage
 
 _CLOCKS_KEPT = 16384
 

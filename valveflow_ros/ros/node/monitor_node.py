@@ -38,10 +38,10 @@ from valveflow_ros.ros.decoding import INPUTS
 from valveflow_ros.ros.domain import Presence
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.outputs import OUTPUTS, SERVICES
+from valveflow_ros.ros.node.polled_subscription import answer_request
 from valveflow_ros.ros.node.recording import check_record_directory
 from valveflow_ros.ros.node.session import DIAGNOSTICS, Session
-from valveflow_ros.ros.outputs import OUTPUTS, SERVICES
-from valveflow_ros.ros.polled_subscription import answer_request
 from valveflow_ros.ros.process import StopFlag, with_place
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS

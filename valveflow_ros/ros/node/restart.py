@@ -21,8 +21,8 @@ from valveflow_ros.records import Readings
 from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, journal_entry
 from valveflow_ros.ros.node.diagnostics import Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine
+from valveflow_ros.ros.node.outputs import Output, Outputs
 from valveflow_ros.ros.node.state_store import StateStore
-from valveflow_ros.ros.outputs import Output, Outputs
 from valveflow_ros.state import State
 
 REASON = 'The monitor was started again; it goes on from its saved state.'

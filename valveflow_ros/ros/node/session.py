@@ -26,12 +26,12 @@ from valveflow_ros.ros.node import health, parameter_files
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, warm_up
 from valveflow_ros.ros.node.intake import Intake, LogClock
+from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs, OutputTopic
+from valveflow_ros.ros.node.polled_subscription import PolledSubscription, qos_overrides
 from valveflow_ros.ros.node.recording import BackgroundRecovery, Recording, recorded_qos, tag_of
 from valveflow_ros.ros.node.restart import Restart
 from valveflow_ros.ros.node.state_store import StateStore
-from valveflow_ros.ros.outputs import OUTPUTS, Output, Outputs, OutputTopic
-from valveflow_ros.ros.polled_subscription import PolledSubscription, qos_overrides
-from valveflow_ros.ros.worker import DiagnosisWorker, FitWorker
+from valveflow_ros.ros.node.worker import DiagnosisWorker, FitWorker
 from valveflow_ros.signals.units import in_unit
 from valveflow_ros.state import State
 

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits and diagnoses in a child process, so that no sample waits for them.
 
-The parent uses `FitWorker` and `DiagnosisWorker`; the child is ``python -m
-valveflow_ros.ros.worker``. Tasks and results are sent as states (`valveflow_ros.state`): plain
-values and arrays with a checksum, no executable content. If a child dies, hangs or gives an
-invalid result, one fit is lost and reported; the pause before the next child then doubles.
+The parent uses `FitWorker` and `DiagnosisWorker`; the child is
+``python -m valveflow_ros.ros.node.worker``. Tasks and results are sent as states
+(`valveflow_ros.state`): plain values and arrays with a checksum, no executable content. If a child
+dies, hangs or gives an invalid result, one fit is lost and reported; the pause before the next
+child then doubles.
 """
 
 from __future__ import annotations
@@ -294,7 +295,7 @@ class Worker:
                 self.word,
             )
             process = subprocess.Popen(
-                [sys.executable, '-m', 'valveflow_ros.ros.worker', *arguments],
+                [sys.executable, '-m', 'valveflow_ros.ros.node.worker', *arguments],
                 stdin=subprocess.DEVNULL,
                 # Output of libraries must not appear as output of the monitor.
                 stdout=2,
