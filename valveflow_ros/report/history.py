@@ -384,7 +384,7 @@ def _curves(history: History) -> list[str | Figure]:
     at, moved = largest_move(history)
     if np.isfinite(moved):
         words += (
-            f' From the one before to the last, the power at the same u changed most at '
+            f' The last curve differs most from the median of the earlier ones at '
             f'u = {decimals(at, 0)}, by {decimals(moved, 2)} MW.'
         )
     return [paragraph(words), curve_history_figure(history)]
@@ -402,16 +402,21 @@ def powers(curves: tuple[CurveMoment, ...], u: FloatArray) -> FloatArray:
 
 
 def largest_move(history: History) -> tuple[float, float]:
-    """Return u of the largest difference of the last two curves, and the difference in MW."""
-    before, last = history.curves[-2:]
-    low, high = max(before.u[0], last.u[0]), min(before.u[-1], last.u[-1])
-    if high <= low:
+    """Return u of the largest difference of the last curve from the median of the earlier ones.
+
+    The second value is that difference in MW; both are NaN if no range is common.
+    """
+    *earlier, last = history.curves
+    u = np.unique(np.concatenate([c.u for c in history.curves]))
+    u = u[(u >= last.u[0]) & (u <= last.u[-1])]
+    before = powers(tuple(earlier), u)
+    known = np.isfinite(before).any(axis=0)
+    if not known.any():
         return float('nan'), float('nan')
-    # The difference is piecewise linear, so its extreme is at a breakpoint of one curve.
-    knots = np.unique(np.clip(np.concatenate([before.u, last.u]), low, high))
-    moved = np.interp(knots, last.u, last.power_mw) - np.interp(knots, before.u, before.power_mw)
+    u, before = u[known], before[:, known]
+    moved = np.interp(u, last.u, last.power_mw) - np.nanmedian(before, axis=0)
     k = int(np.argmax(np.abs(moved)))
-    return float(knots[k]), float(moved[k])
+    return float(u[k]), float(moved[k])
 
 
 def curve_history_figure(history: History) -> Figure:
