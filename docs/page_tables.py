@@ -83,7 +83,7 @@ def _literal(module: str, name: str) -> ast.expr:
 
 def output_topics() -> dict[str, tuple[str, bool]]:
     """Return type and whether it is latched of every output topic of the node."""
-    found = _literal('outputs.py', 'OUTPUTS')
+    found = _literal('node/outputs.py', 'OUTPUTS')
     assert isinstance(found, ast.Dict)
     topics = {}
     for key, call in zip(found.keys, found.values, strict=True):
@@ -111,7 +111,7 @@ def outputs() -> str:
 
 def service_names() -> list[str]:
     """Return the services the node offers, without ``~/``."""
-    return list(ast.literal_eval(_literal('outputs.py', 'SERVICES')))
+    return list(ast.literal_eval(_literal('node/outputs.py', 'SERVICES')))
 
 
 def services() -> str:
