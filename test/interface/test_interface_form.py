@@ -69,6 +69,14 @@ def test_a_unit_of_the_paper_s_form_keeps_it():
     assert error_mw(plant(unit=unit), found.characteristic) < 1.0
 
 
+@pytest.mark.parametrize('seed', [401, 406])
+def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
+    simulation = vf.simulate(4.0, seed, unit=f'sequence:number={seed}')
+    curve = vf.identify(simulation.log).characteristic
+    assert (curve.axis, curve.form.told) == (OPENING, True)
+    assert error_mw(simulation, curve) < 1.0
+
+
 def test_a_model_of_the_wrong_form_is_the_first_finding():
     given = identified(INTEGRATED_INPUT).characteristic
     found = vf.diagnose(plant(4).log, model=given).diagnosis

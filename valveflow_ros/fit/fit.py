@@ -20,7 +20,7 @@ from valveflow_ros.curve.characteristic import (
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.fit.model_form import find_form
+from valveflow_ros.fit.model_form import FoundForm, find_form
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import refine, search
 from valveflow_ros.fit.result import NOT_REFINED, from_refined, residual_statistics, with_support
@@ -187,20 +187,22 @@ def _formed(task: FitTask) -> _Formed:
     if not len(contents.opening_percent):
         return paper
     pressure = pressure_of(contents.u, contents.opening_percent, exponent)
-    found = find_form(
-        contents.opening_percent, pressure, contents.power_mw, contents.spans[:, :2],
-        task.settings.real('sample_period'), exponent, task.settings.text('axis'), task.form,
-        task.known,
-    )  # fmt: skip
+    rows = contents.opening_percent, pressure, contents.power_mw
+    period, axis = task.settings.real('sample_period'), task.settings.text('axis')
+    special = contents.spans[:, :2]
+    found = find_form(*rows, special, period, exponent, axis, task.form, task.known)
     if found is None:
         return paper
+    free = axis == 'auto' and task.form is None and task.known is None
+    if free and found.evidence is not None and not found.evidence.told:
+        found = _found_in_all_rows(contents, pressure, period, exponent) or found
     u, scale = found.form.of_rows(contents.opening_percent, pressure)
     if found.form == paper.form:
         return replace(paper, evidence=found.evidence)
     # The noise of u must be in the unit of the axis.
-    rows = contents.special_rows()
+    at = contents.special_rows()
     with np.errstate(invalid='ignore', divide='ignore'):
-        ratio = float(np.nanmedian(u[rows] / contents.u[rows]))
+        ratio = float(np.nanmedian(u[at] / contents.u[at]))
     formed = replace(
         task, contents=replace(contents, u=u), input_noise=task.input_noise * abs(ratio)
     )
@@ -212,6 +214,26 @@ def _formed(task: FitTask) -> _Formed:
         found.evidence,
         task.form is not None or found.evidence is None or not found.evidence.told,
     )
+
+
+def _found_in_all_rows(
+    contents: WindowContents, pressure: FloatArray, period_s: float, exponent: float
+) -> FoundForm | None:
+    """Return the form if all rows decide it; used if the special segments do not.
+
+    Special segments may be too few in the part of the range where the forms differ. Means over
+    a minute of all rows carry some dynamics too, which are alike in both forms: this is used to
+    choose the form, but neither for the exponent of the paper's form nor for c.
+    """
+    rows = contents.opening_percent, pressure, contents.power_mw
+    breaks = np.flatnonzero(np.diff(contents.time_ns) > 1.5e9 * period_s) + 1
+    stretches = np.column_stack([np.append(0, breaks), np.append(breaks, len(pressure))])
+    found = find_form(*rows, stretches, period_s, exponent)
+    if found is None or found.evidence is None or not found.evidence.told:
+        return None
+    form = found.form if found.form.scaled else StaticForm(INTEGRATED_INPUT, exponent)
+    held = find_form(*rows, contents.spans[:, :2], period_s, exponent, held=form)
+    return None if held is None else replace(held, evidence=found.evidence)
 
 
 def _pressure(task: FitTask, rows: IntArray) -> float:
