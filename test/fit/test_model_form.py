@@ -89,6 +89,8 @@ def test_where_the_pressure_stands_still_nothing_is_told(form, seed) -> None:
     found = find_form(v, p, y, spans, PERIOD_S, PAPER)
     assert found is not None
     assert not found.evidence.told
+    assert found.exponent_held
+    assert found.form.exponent in (1.0, PAPER)
     assert found.evidence.apart_mw < 0.5, 'they are one curve there'
 
 

@@ -212,7 +212,7 @@ def _formed(task: FitTask) -> _Formed:
         found.offset_mw,
         scale,
         found.evidence,
-        task.form is not None or found.evidence is None or not found.evidence.told,
+        found.exponent_held,
     )
 
 
@@ -233,7 +233,9 @@ def _found_in_all_rows(
         return None
     form = found.form if found.form.scaled else StaticForm(INTEGRATED_INPUT, exponent)
     held = find_form(*rows, contents.spans[:, :2], period_s, exponent, held=form)
-    return None if held is None else replace(held, evidence=found.evidence)
+    if held is None:
+        return None
+    return replace(held, evidence=found.evidence, exponent_held=found.exponent_held)
 
 
 def _pressure(task: FitTask, rows: IntArray) -> float:

@@ -41,6 +41,8 @@ _EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
 # If undecided, the form over V is used if its gain exceeds this many standard errors.
 _LIKELIER_Z = 1.5
 _CHOKED_EXPONENT = 1.0
+# Below this range of the pressure, as fraction of its median, an exponent is mostly noise.
+_LEAST_RANGE = 0.1
 _WORST = 0.05
 _LEAST_IN_CELL, _EIGHTHS = 5, 8
 _MISFIT = 0.01  # of the power's range
@@ -58,11 +60,14 @@ class FoundForm:
         Initial c of a fit; 0 for a form without c.
     evidence : FormEvidence or None
         None if the data are too few to compare a given form with the other.
+    exponent_held : bool
+        A fit should not change the exponent: it is given, or the data do not determine it.
     """
 
     form: StaticForm
     offset_mw: float
     evidence: FormEvidence | None
+    exponent_held: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,13 +141,16 @@ def find_form(
                 'Means over a minute in special segments, to find the numbers of p^m F(V) + c',
                 len(means), _LEAST_MEANS, 'A longer log would help.',
             )  # fmt: skip
-        return None if held is None else FoundForm(held, 0.0, None)
+        return None if held is None else FoundForm(held, 0.0, None, True)
     choked = known.exponent if known is not None and known.scaled else _CHOKED_EXPONENT
     usual = known if known is not None and not known.scaled else None
     paper = _with_exponent(means, usual or StaticForm(INTEGRATED_INPUT, exponent))
-    scaled = _best(means, OPENING)
+    low, middle, high = np.quantile(means.pressure, (0.02, 0.5, 0.98))
+    moves = bool(high - low > _LEAST_RANGE * middle)
+    scaled = _best(means, OPENING) if moves else _fitted(means, StaticForm(OPENING, choked))
     if known is not None and known.scaled:
         scaled = _with_exponent(means, known)
+    given = held is not None
     if held is not None:
         paper, scaled = (
             _fitted(means, held) if fit.form.axis == held.axis else fit for fit in (paper, scaled)
@@ -150,8 +158,8 @@ def find_form(
     elif axis == OPENING:
         held = scaled.form
     gain, sure, told = _told(means, scaled, paper)
-    if held is None and not told:
-        # The pressure changes too little to determine its exponent: use that of ideal choked flow.
+    if held is None and moves and not told:
+        # The exponent is not determined: use that of ideal choked flow.
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
     takes_scaled = gain > _LEAST_GAIN and sure > _LIKELIER_Z
@@ -176,7 +184,7 @@ def find_form(
         contradicted=held is not None and _told(means, other, chosen)[2],
     )
     offset = _offset(means, chosen) if chosen.form.scaled else 0.0
-    return FoundForm(chosen.form, offset, evidence)
+    return FoundForm(chosen.form, offset, evidence, given or not (told and moves))
 
 
 @dataclass(frozen=True, slots=True)
