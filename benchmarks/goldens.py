@@ -38,7 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TEXTS = ('.csv', '.json', '.txt', '.yaml')
 LONGEST = 1_000_000
 # These come when work takes long or is done for the first time.
-_TIMED = re.compile(r'^( *\d+ % .*|The engine is compiled .*)\n', re.MULTILINE)
+_TIMED = re.compile(r'^( *\d+ % .*|The program is now compiled .*)\n', re.MULTILINE)
 # Names of clipping paths in an SVG file hang on where things lay in memory.
 _CLIP = re.compile(r'\bp[0-9a-f]{10}\b')
 _SPOKEN = ('aria-label', 'data-label', 'title', 'content')

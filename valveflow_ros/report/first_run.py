@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Check whether the engine must be compiled first, which takes about a minute, once."""
+"""Check whether the engine must be compiled first, which is done once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-SENTENCE = 'The engine is compiled for this machine now, once; that takes about a minute.'
+SENTENCE = 'The program is now compiled for this machine, once. This takes about half a minute.'
 _FOLDERS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
 _ENGINE = tuple(f'valveflow_ros.{name}' for name in _FOLDERS)
 # Some functions are compiled only as part of others, or for tests.
