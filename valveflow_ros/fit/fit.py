@@ -194,8 +194,8 @@ def _formed(task: FitTask) -> _Formed:
     if found is None:
         return paper
     free = axis == 'auto' and task.form is None and task.known is None
-    if free and found.evidence is not None and not found.evidence.told:
-        found = _found_in_all_rows(contents, pressure, period, exponent) or found
+    if free:
+        found = _found_in_all_rows(found, contents, pressure, period, exponent)
     u, scale = found.form.of_rows(contents.opening_percent, pressure)
     if found.form == paper.form:
         return replace(paper, evidence=found.evidence)
@@ -217,25 +217,31 @@ def _formed(task: FitTask) -> _Formed:
 
 
 def _found_in_all_rows(
-    contents: WindowContents, pressure: FloatArray, period_s: float, exponent: float
-) -> FoundForm | None:
-    """Return the form if all rows decide it; used if the special segments do not.
+    found: FoundForm,
+    contents: WindowContents,
+    pressure: FloatArray,
+    period_s: float,
+    exponent: float,
+) -> FoundForm:
+    """Return the form that all rows require if it is not the one found in special segments.
 
     Special segments may be too few in the part of the range where the forms differ. Means over
-    a minute of all rows carry some dynamics too, which are alike in both forms: this is used to
+    a minute of all rows carry some dynamics too, which are alike in both forms: they are used to
     choose the form, but neither for the exponent of the paper's form nor for c.
     """
     rows = contents.opening_percent, pressure, contents.power_mw
     breaks = np.flatnonzero(np.diff(contents.time_ns) > 1.5e9 * period_s) + 1
     stretches = np.column_stack([np.append(0, breaks), np.append(breaks, len(pressure))])
-    found = find_form(*rows, stretches, period_s, exponent)
-    if found is None or found.evidence is None or not found.evidence.told:
-        return None
-    form = found.form if found.form.scaled else StaticForm(INTEGRATED_INPUT, exponent)
+    decided = find_form(*rows, stretches, period_s, exponent)
+    if decided is None or decided.evidence is None or not decided.evidence.told:
+        return found
+    same = decided.form.axis == found.form.axis
+    if same and found.evidence is not None and found.evidence.told:
+        return found
+    form = decided.form if decided.form.scaled else StaticForm(INTEGRATED_INPUT, exponent)
     held = find_form(*rows, contents.spans[:, :2], period_s, exponent, held=form)
-    if held is None:
-        return None
-    return replace(held, evidence=found.evidence, exponent_held=found.exponent_held)
+    assert held is not None  # a form that is given always has an answer
+    return replace(held, evidence=decided.evidence, exponent_held=decided.exponent_held)
 
 
 def _pressure(task: FitTask, rows: IntArray) -> float:
