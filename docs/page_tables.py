@@ -21,7 +21,7 @@ _NODE = ROOT / 'valveflow_ros' / 'ros'
 # What each output is good for, in a line; the test asks for all of them.
 _OUTPUTS = {
     'characteristic': 'the curve with its errors',
-    'breakpoints': 'the same for stock clients: the knees',
+    'breakpoints': 'the same for standard clients: the breakpoints',
     'slopes': 'the same for stock clients: the slopes',
     'prediction': 'each row: measured, predicted, residual, limits',
     'segments': 'each special segment when it closes',

@@ -322,11 +322,11 @@ _ALARM = (
 
 _SHIFT = (
     Parameter('reference_file', '', '',
-              'A characteristic.json that later curves are judged against; empty waits for '
-              '~/set_reference.'),
+              'A characteristic.json that later curves are compared with; empty: see '
+              'reference_after.'),
     Parameter('reference_after', 3.0, 'd',
-              'A curve becomes the reference by itself when nothing was wrong for this long after '
-              'it; 0 leaves that to ~/set_reference.', 0.0, 60.0, live=True),
+              'A curve of this long becomes the reference automatically after as long without a '
+              'fault; 0: only by ~/set_reference.', 0.0, 60.0, live=True),
     Parameter('wear_budget', 3.0, 'MW/month',
               'Slow change of the curve up to this is followed and reported as wear; beyond it '
               'there is an alarm.', 0.0, 1e4, live=True),
@@ -345,7 +345,7 @@ _DIAGNOSIS = (
     Parameter('diagnosis_on_mismatch', True, '',
               'Diagnose when the model no longer fits.', live=True),
     Parameter('diagnosis_hour', 2, 'h UTC',
-              'Diagnose every night at this hour of the time of the samples; -1 does not.',
+              'Hour of the day, in UTC, at which a diagnosis is made every day; -1: none.',
               -1, 23, live=True),
     Parameter('diagnosis_pause', 3.0, 'h',
               'Least time between two diagnoses that were not asked for by hand.',

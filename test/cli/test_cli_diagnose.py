@@ -66,9 +66,14 @@ def test_the_extended_model_can_be_read(diagnosed):
 
 def test_the_page_tells_four_steps(diagnosed):
     page = (diagnosed / 'out' / 'report.html').read_text()
-    for step in ('1. What is wrong', '2. Why', '3. The extended model', '4. The proof'):
+    for step in (
+        '1. What is wrong',
+        '2. Why',
+        '3. The extended model',
+        '4. Check on held-out data',
+    ):
         assert step in page
-    assert 'single wild values' in page
+    assert 'single outliers' in page
     assert 'time (UTC)' in page
     assert 'days after' not in page
 

@@ -38,7 +38,10 @@ def test_the_result_says_what_was_held(identified):
     assert not (identified / 'plain' / 'extended_model.json').exists()
     page = (identified / 'held' / 'report.html').read_text()
     assert 'output_offset_drift (b_mw = 8)' in page
-    assert 'Held, and taken out' not in (identified / 'plain' / 'report.html').read_text()
+    assert (
+        'The effect of these known causes was removed'
+        not in (identified / 'plain' / 'report.html').read_text()
+    )
 
 
 def test_the_extended_model_gets_the_new_curve(identified):
@@ -57,7 +60,7 @@ def test_the_summary_says_it_too(run, logs, identified, tmp_path):
         'identify', logs / 'plant.parquet', '-o', tmp_path / 'o', *how, '--set',
         'selection_rule=paper',
     )  # fmt: skip
-    assert 'Held, and taken out of opening and power before anything else' in ran.out
+    assert 'The effect of these known causes was removed from the data first' in ran.out
     assert 'backlash (w_percent = 0.1)' in ran.out
 
 
@@ -70,7 +73,10 @@ def test_validate_takes_both_kinds_of_file(run, logs, identified, tmp_path):
 
     extended = checked(identified / 'held' / 'extended_model.json')
     assert extended.json['held'] == list(HELD)
-    assert 'Held, and taken out' in (tmp_path / 'v' / 'report.html').read_text()
+    assert (
+        'The effect of these known causes was removed'
+        in (tmp_path / 'v' / 'report.html').read_text()
+    )
     plain = checked(identified / 'plain')
     assert plain.json['held'] == []
     half = checked(identified / 'held' / 'characteristic.json')

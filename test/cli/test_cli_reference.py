@@ -70,7 +70,7 @@ def test_a_curve_is_judged_against_a_reference(run, logs, tmp_path):
     ran = run('identify', logs / 'plant.mcap', '-o', tmp_path / 'b', '--reference', model,
               '--json')  # fmt: skip
     assert ran.json['shift']['moved'] is True
-    assert ran.json['shift']['sentence'].startswith('Piece ')
+    assert ran.json['shift']['sentence'].startswith('At ')
     sizes = [p['shift_mw'] for p in ran.json['shift']['pieces'] if p['moved']]
     assert sizes == pytest.approx([-9.0] * len(sizes), abs=1.5)
     page = (tmp_path / 'b' / 'report.html').read_text(encoding='utf-8')

@@ -103,13 +103,13 @@ def test_a_piece_without_data_of_its_own_is_marked_and_says_what_would_help():
     assert [s.identifiable for s in told.support] == [True, False, False]
     assert told.support[2].samples == 0
     second, third = told.notes[-2:]
-    assert second.startswith('Piece 2 (u 1400 to 1800) rests on one steady level, u 1500: ')
-    assert 'an hour at u 1720 (' in second
-    assert third.startswith('Piece 3 (u 1800 to 2200) rests on no special sample: ')
-    assert 'an hour each at u 1880 (' in third
+    assert second.startswith('Piece 2 (80 to 120 MW) has steady data at one load only, ')
+    assert 'operation at about ' in second
+    assert re.match(r'Piece 3 \(\d+ to \d+ MW\) has no data in special segments, ', third)
+    assert re.search(r'operation at about \d+ MW and one at \d+ MW would', third)
     touched = contents((1000.0, 1408.0, SLOPE))
     (*_, said) = with_support(curve([1000.0, 1400.0, 1800.0], [0.2, 0.1]), touched, NOISE).notes
-    assert re.search(r'rests on no special segment, only on \d+ samples? at their ends', said), (
+    assert re.search(r'has no special segment of its own, only \d+ samples? at the ends', said), (
         said
     )
     everywhere = contents(*[(u, u + 90.0, SLOPE) for u in range(1000, 2200, 100)])

@@ -204,9 +204,9 @@ FAULTS = {
             * s.static, ('time of day (cosine)',), 'time of day'),
     'direction': (lambda s: -1.2 * direction(s), ('direction',), 'opening and closing'),
     'slower': (lambda s: -0.3 * (s.static - s.dynamic) * (s.u < 1500.0), ('lag at low load',),
-               'slower at low load'),
+               'at low load the power follows the valve more slowly'),
     'bump': (lambda s: 3.0 * np.maximum(0.0, 1.0 - np.abs(s.u - 1364.0) / 90.0), ('bin 4 of u',),
-             'around u = 1364'),
+             'at about u = 1364'),
 }  # fmt: skip
 
 

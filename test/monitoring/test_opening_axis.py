@@ -143,5 +143,5 @@ def test_curves_of_different_axes_are_not_held_against_each_other():
     curve = learnt()[0].characteristic
     assert curve is not None
     paper = curve.at_pressure()
-    with pytest.raises(DataError, match='cannot be held against each other'):
+    with pytest.raises(DataError, match='cannot be compared'):
         judge_shift(paper, curve, ())

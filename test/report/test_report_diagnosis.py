@@ -55,7 +55,8 @@ def test_the_proof_says_what_its_differences_are_means_over(mean_s, told):
 def test_the_steps_follow_in_their_order(page):
     titles = [s.title for s in page.sections]
     assert titles == [
-        'The answer', '1. What is wrong', '2. Why', '3. The extended model', '4. The proof',
+        'The answer', '1. What is wrong', '2. Why', '3. The extended model',
+        '4. Check on held-out data',
         'How the curve moved', 'What the monitor said',
     ]  # fmt: skip
 
@@ -106,5 +107,5 @@ def test_what_changes_with_time_is_counted_from_the_mean():
     for name, cause in causes.catalogue().items():
         changes = 'ramp' in cause.act.__code__.co_names or name == 'intervals'
         told = held_words((HeldCause(name, (('x', 0.3),), 'It is so.'),))
-        assert ('curve is that of this mean' in told) == changes, name
+        assert ('curve contains the mean effect' in told) == changes, name
         assert ('without it' in told) == (not changes), name

@@ -251,8 +251,8 @@ def add_table(parser: ArgumentParser, gathered: str) -> None:
         ('decimal', 'point|comma', 'what stands before the decimals of a number'),
         ('sheet', 'NAME', 'which sheet of a workbook'),
         ('max-unpacked', 'MB',
-         'to how much a workbook or a Parquet file may unpack (default: 64 MB, or 200 times its '
-         'size if that is more, up to 1074 MB and 2147 MB)'),
+         'largest unpacked size of a table (default: 64 MB or 200 times the size of the file, '
+         'whichever is larger; at most 1074 MB for a workbook and 2147 MB for Parquet)'),
         ('period', 'TIME', 'time from one row to the next, such as 60s or 1min, where no column '
          'holds times; the first row is then at 2000-01-01'),
     ):  # fmt: skip
@@ -295,7 +295,7 @@ def add_analysis_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='one parameter, such as time_constant=120; stands above the file',
+        help='one parameter, such as time_constant=120; overrides the file',
     )  # fmt: skip
     parser.add_argument(
         '--figures', action='store_true',

@@ -289,6 +289,19 @@ class Characteristic:
         """Return p^e at the pressure at which the curve is shown; 1 for the paper's form."""
         return float(self.static_form.scale(self.shown_at_mpa))
 
+    def place_words(self, u_from: float, u_to: float | None = None) -> str:
+        """Return a place or a range on the curve in words of an operator.
+
+        This is the opening if u is the opening, else the power: the opening of a u depends on
+        the pressure.
+        """
+        ends = np.array([u_from] if u_to is None else [u_from, u_to])
+        if self.pressure_exponent == 0.0:
+            return ' to '.join(f'{v:.0f}' for v in ends.tolist()) + ' % opening'
+        knots = self.breakpoints
+        power = self(np.clip(ends, knots[0], knots[-1]))
+        return ' to '.join(f'{y:.0f}' for y in power.tolist()) + f' {self.output_unit}'
+
     @property
     def breakpoints(self) -> FloatArray:
         """Return the boundary point vector U of the paper, shape (J + 1,)."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -35,30 +35,35 @@ from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
 _SURE = 0.9999
 
 
-def shift_sentence(shift: Shift, knots: FloatArray) -> str:
+def shift_sentence(shift: Shift, reference: Characteristic) -> str:
     """Return a sentence on the piece that shifted, the size, onset and confidence; or on no shift.
 
     Parameters
     ----------
     shift : Shift
-    knots : float64 (J + 1,)
-        Of the reference; possibly only a part of it was compared.
+    reference : Characteristic
+        Possibly only a part of it was compared.
     """
-    return _judgement(shift) + _compared(shift, float(knots[0]), float(knots[-1]))
+    return _judgement(shift, reference) + _compared(shift, reference)
 
 
-def _compared(shift: Shift, first: float, last: float) -> str:
+def _compared(shift: Shift, reference: Characteristic) -> str:
     """Return a sentence on the compared range if it is not the whole reference."""
+    first, last = float(reference.breakpoints[0]), float(reference.breakpoints[-1])
     known = [p for p in shift.pieces if math.isfinite(p.u_from)]
     low, high = min(p.u_from for p in known), max(p.u_to for p in known)
     if low <= first and high >= last:
         return ''
-    return f' Compared is u {low:.0f} to {high:.0f} of its u {first:.0f} to {last:.0f}.'
+    return (
+        f' Only the range {reference.place_words(low, high)} could be compared; the '
+        f'reference covers {reference.place_words(first, last)}.'
+    )
 
 
-def _judgement(shift: Shift) -> str:
+def _judgement(shift: Shift, curve: Characteristic) -> str:
     known = [p for p in shift.pieces if math.isfinite(p.middle_mw)]
-    reference = f'the reference of {day(shift.reference_ns)}'
+    made = minute(shift.reference_ns) if shift.reference_ns > 0 else 'unknown date'
+    reference = f'the reference of {made}'
     worst = shift.largest
     if worst is None:
         smallest = [p.smallest_mw for p in known if math.isfinite(p.smallest_mw)]
@@ -75,25 +80,17 @@ def _judgement(shift: Shift) -> str:
     side = 'more' if worst.shift_mw > 0.0 else 'less'
     others = [k + 1 for k, p in enumerate(shift.pieces) if p.moved and k + 1 != number]
     return (
-        f'Piece {number} (u {short(worst.u_from)} to {short(worst.u_to)}) gives '
+        f'At {curve.place_words(worst.u_from, worst.u_to)} (piece {number}) the unit gives '
         f'{short(abs(worst.shift_mw), 1)} MW ({abs(worst.percent):.1f} %) {side} than '
-        f'{reference}, {_since_words(shift)}. Confidence that it moved: {_confidence(worst)}.'
+        f'{reference}, {_since_words(shift)}. Confidence: {_confidence(worst)}.'
         f'{_others(shift, others)}'
     )
 
 
-def day(time_ns: int) -> str:
-    """Return a date as text; 'unknown date' for an unknown time."""
-    return _at(time_ns, 'D') if time_ns > 0 else 'unknown date'
-
-
 def minute(time_ns: int) -> str:
     """Return a date with hours and minutes as text, UTC."""
-    return _at(time_ns, 'm').replace('T', ' ') + ' UTC'
-
-
-def _at(time_ns: int, unit: Literal['D', 'm']) -> str:
-    return str(np.datetime64(time_ns // NS_PER_S, 's').astype(f'datetime64[{unit}]'))
+    at = np.datetime64(time_ns // NS_PER_S, 's').astype('datetime64[m]')
+    return f'{at}'.replace('T', ' ') + ' UTC'
 
 
 def _since_words(shift: Shift) -> str:
@@ -308,7 +305,7 @@ def judge_shift(
         reference.model_id, current.model_id, reference.source.window_end_ns,
         int(found.time_ns[0]) if len(found) else 0, pieces, *since, '',
     )  # fmt: skip
-    return replace(shift, sentence=shift_sentence(shift, reference.breakpoints))
+    return replace(shift, sentence=shift_sentence(shift, reference))
 
 
 def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) -> str:
@@ -347,7 +344,7 @@ def _comparable(reference: Characteristic, current: Characteristic) -> None:
     if reference.axis != current.axis:
         raise DataError(
             f'The reference is a curve of {reference.static_form.words} and the current one of '
-            f'{current.static_form.words}: they cannot be held against each other.'
+            f'{current.static_form.words}: they cannot be compared.'
         )
     if reference.pressure_exponent != current.pressure_exponent:
         raise DataError(

@@ -579,10 +579,10 @@ def _meaning(task: Task, model: Extended, cause: Active) -> str:
         return ''
     most = float(np.ptp(np.quantile(moved, (0.01, 0.99))))
     if not max(abs(level), reach) > _ACTS * most:
-        return f'{where} it changes nothing, at other loads up to {most:.2g} MW.'
+        return f'{where} the power is not changed, at other loads by up to {most:.2g} MW.'
     if not level:
-        return f'{where} it moves the power by up to {reach:.2g} MW.'
-    said = f'{where} it is {abs(level):.2g} MW {"more" if level > 0.0 else "less"}'
+        return f'{where} the power changes by up to {reach:.2g} MW.'
+    said = f'{where} this makes {abs(level):.2g} MW {"more" if level > 0.0 else "less"}'
     drifts = cause.cause.slow and onset is None and not cause.extra and cause.name != 'diurnal'
     return f'{said} at the end of the record than at its beginning.' if drifts else f'{said}.'
 
@@ -732,7 +732,7 @@ def _sentence(d: Diagnosis) -> str:
         drifts = d.disturbance is not None and d.disturbance.drift_mw is not None
         return ' '.join(c.sentence for c in d.causes) + (wander if drifts else '')
     blind = [name for name, reason in d.rejected if 'cannot be judged' in reason]
-    but = f' Not judged, for want of what this record lacks: {listed(blind)}.' if blind else ''
+    but = f' These causes could not be checked with this record: {listed(blind)}.' if blind else ''
     if d.verdict == NOTHING:
         slow = '' if d.disturbance is None else 'a slow disturbance and '
         return (

@@ -152,8 +152,8 @@ class Evidence:
         told = []
         if not self.gain > LEAST_GAIN:
             told.append(
-                'it explains held-out blocks only a little better '
-                f'(log-likelihood {self.gain:+.1f}, {LEAST_GAIN:.0f} needed)'
+                'it explains held-out data too little better '
+                f'({self.gain:+.1f} in log-likelihood, {LEAST_GAIN:.0f} needed)'
             )
         if not self.wald > self.least_wald:
             told.append(

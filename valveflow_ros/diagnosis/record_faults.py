@@ -47,21 +47,21 @@ class Fault:
     @property
     def sentence(self) -> str:
         """Return a sentence for an operator."""
-        what = self.signal.topic
+        what = self.signal.topic.replace('_', ' ')
         if self.name == 'flatline':
             return (
-                f'The record of {what} stands still for up to {self.size:.0f} s at a time; '
-                f'{counted(self.rows, "row was", "rows were")} not believed.'
+                f'The recorded {what} did not change for up to {self.size:.0f} s; '
+                f'{counted(self.rows, "row was", "rows were")} left out.'
             )
         if self.name == 'spikes':
             return (
-                f'The record of {what} has {counted(self.rows, "single wild value")} of '
+                f'The recorded {what} has {counted(self.rows, "single outlier")} of '
                 f'about {self.size:.2g} {self.signal.unit}; '
-                f'{"it was" if self.rows == 1 else "they were"} not believed.'
+                f'{"it was" if self.rows == 1 else "they were"} left out.'
             )
         return (
-            f'{what} is recorded in steps of {self.size:.2g} {self.signal.unit}, coarser than it '
-            'moves from row to row.'
+            f'The {what} is recorded in steps of {self.size:.2g} {self.signal.unit}, coarser '
+            'than it moves from row to row.'
         )
 
 

@@ -95,12 +95,12 @@ class Disturbance:
         if self.drift_mw is not None:
             length = 'days' if hours >= _DAYS_FROM_H else 'hours'
             return (
-                f'The power drifts by {self.drift_mw:.2g} MW over {length}, which has no cause in '
-                'these signals.'
+                f'The power varies slowly over {length}, by about {self.drift_mw:.2g} MW, for a '
+                'reason that these signals do not show.'
             )
         return (
-            f'The power wanders slowly by {self.rms_mw:.2g} MW over about {hours:.2g} h, which '
-            'has no cause in these signals.'
+            f'The power varies slowly, by about {self.rms_mw:.2g} MW over {hours:.2g} h, for a '
+            'reason that these signals do not show.'
         )
 
 

@@ -259,8 +259,8 @@ def shifted(likely: dict[int, float], by: int) -> dict[int, float]:
 def evidence_words(pieces: int, likely: dict[int, float]) -> str:
     """Return a sentence on the evidence for the number of pieces."""
     words = (
-        f'J = {pieces} was taken by what each breakpoint gains in the whitened prediction error '
-        f'of all rows (at least {KNEE_GAIN:g} in log-likelihood)'
+        f'J = {pieces}: each breakpoint reduces the prediction error of all rows clearly (by at '
+        f'least {KNEE_GAIN:g} in log-likelihood)'
     )
     if pieces in likely:
         percent = 100.0 * likely[pieces]

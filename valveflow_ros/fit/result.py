@@ -215,7 +215,7 @@ def with_support(
         for k, piece in enumerate(c.pieces)
     )
     notes = [
-        _sentence(k + 1, piece, found)
+        _sentence(c, k + 1, piece, found)
         for k, (piece, found) in enumerate(zip(c.at_pressure().pieces, support, strict=True))
         if not found.identifiable
     ]
@@ -296,26 +296,23 @@ def _distinct(levels: list[float], apart: float) -> list[float]:
     return found
 
 
-def _sentence(number: int, piece: Piece, found: Support) -> str:
+def _sentence(c: Characteristic, number: int, piece: Piece, found: Support) -> str:
     """Return a sentence on the data of a piece, and on the data that it needs."""
-    name = f'Piece {number} (u {short(piece.u_from)} to {short(piece.u_to)})'
+    name = f'Piece {number} ({c.place_words(piece.u_from, piece.u_to)})'
     if not found.samples:
-        rests = 'rests on no special sample'
+        rests = 'has no data in special segments'
     elif not found.levels and not found.slope_response:
         few = counted(found.samples, 'sample')
-        rests = f'rests on no special segment, only on {few} at their ends'
+        rests = f'has no special segment of its own, only {few} at the ends of others'
     elif not found.levels:
-        rests = 'rests on slope responses that hardly move in it'
+        rests = 'has data only in slope responses that hardly move'
     else:
-        rests = f'rests on one steady level, u {short(found.levels[0])}'
+        rests = 'has steady data at one load only'
     places = _missing(piece, np.array(found.levels))
-    loads = ' and '.join(
-        f'u {short(u)} ({short(piece.slope * u + piece.intercept)} MW)' for u in places
-    )
-    each = ' each' if len(places) > 1 else ''
+    loads = ' and one at '.join(f'{short(piece.slope * u + piece.intercept)} MW' for u in places)
     return (
-        f'{name} {rests}: its slope comes from the neighbours and from fast moves; '
-        f'an hour{each} at {loads} would settle it.'
+        f'{name} {rests}, so its slope is uncertain. One hour of constant operation at about '
+        f'{loads} would give it.'
     )
 
 

@@ -302,7 +302,10 @@ def _see(
         raise DataError(f'{name}: {error}') from None
     told = (*log.notes, *notes)
     if observed.clock_resets:
-        back = f'{name}: the clock went back; where it stayed, what it had passed is out.'
+        back = (
+            f'{name}: the time stamps go back within the log. Where they did not return, the '
+            'rows with the later times were left out.'
+        )
         progress.warn(back)
         told = (*told, back)
     return observed, settings, told

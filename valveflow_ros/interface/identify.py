@@ -209,7 +209,8 @@ def _identified(
     told = []
     if observed.clock_resets:
         told.append(
-            'The clock went back within the log; where it stayed, what it had passed is out.'
+            'The time stamps go back within the log. Where they did not return, the rows with '
+            'the later times were left out.'
         )
     if looks_like_step_test(observed.table, settings):
         told.append(STEP_TEST_ADVICE)

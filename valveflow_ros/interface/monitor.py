@@ -117,8 +117,8 @@ class MonitorResult(Result):
             )
         days = self.settings.real('reference_after')
         return (
-            f'No curve became the reference, so none could be found to have shifted: that takes '
-            f'{days:g} days without trouble behind a curve, or --reference FILE.'
+            'There was no reference curve, so no shift could be found. A reference needs about '
+            f'twice {days:g} days without a fault; or give one with --reference FILE.'
         )
 
     @property

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from valveflow_ros.curve.shift import PieceShift, Shift
+from valveflow_ros.curve.shift import PieceShift, Shift, minute
 from valveflow_ros.errors import DataError, listed
 from valveflow_ros.monitoring.alarm_state import (
     Alarm,
@@ -326,10 +326,10 @@ class ResidualAlarm(Alarm):
     def _content(self, state: AlarmState) -> Content:
         value, shift_mw = self.judged.evidence, self.judged.shift_mw
         if abs(shift_mw) > 0.0 or state != AlarmState.UNACKNOWLEDGED or not self._left_mw:
-            return Content(value, _LIMIT, '', _sentence(state, shift_mw))
+            return Content(value, _LIMIT, '', _sentence(state, shift_mw, self.onset_ns))
         side = 'more' if self._left_mw > 0.0 else 'less'
         sentence = (
-            f'The unit gave {abs(self._left_mw):.1f} MW {side} than the valve curve says. The '
+            f'The unit gave {abs(self._left_mw):.1f} MW {side} than its valve curve. The '
             'openings since then do not show whether the difference is still there.'
         )
         return Content(value, _LIMIT, '', sentence)
@@ -342,16 +342,17 @@ class ResidualAlarm(Alarm):
         )
 
 
-def _sentence(state: AlarmState, shift_mw: float) -> str:
+def _sentence(state: AlarmState, shift_mw: float, onset_ns: int) -> str:
     """Return a sentence about the change that tells an operator what to do."""
     side = 'more' if shift_mw > 0.0 else 'less'
     known = abs(shift_mw) > 0.0
+    since = f', since about {minute(onset_ns)}' if onset_ns > 0 else ''
     if state == AlarmState.UNACKNOWLEDGED and not known:
         return 'The unit does not follow its valve curve; the difference in MW is not known.'
     if state == AlarmState.UNACKNOWLEDGED:
         return (
-            f'The unit gives {abs(shift_mw):.1f} MW {side} than the valve curve says, and this '
-            'continues: check what changed, or identify again.'
+            f'The unit gives {abs(shift_mw):.1f} MW {side} than its valve curve{since}. '
+            'Check what changed then. If the change was intended, request a new curve (~/refit).'
         )
     if state == AlarmState.ACKNOWLEDGED and not known:
         return 'Acknowledged; the difference in MW is not known yet.'

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from typing import Protocol
 
 import numpy as np
@@ -144,7 +143,7 @@ class DiagnosisRequests:
         if hour == self._hour:
             return []
         self._hour = hour
-        events = self._judge()
+        events = self._judge(curve)
         night = self._night_of(time_ns)
         another = night not in (self._night, self._night_before)
         tonight = another and self.settings.whole('diagnosis_hour') >= 0
@@ -247,16 +246,16 @@ class DiagnosisRequests:
         self._night_before, self._hour, self._night = self._night, None, None
         return events
 
-    def _judge(self) -> list[Event]:
+    def _judge(self, curve: Characteristic | None) -> list[Event]:
         """Report that the model no longer fits, or fits again; the alarm reports itself."""
         if self._alarm.active and not self._raised:
             self._want(ALARM)
         self._raised = self._alarm.active
-        self.misfit = self._mismatch.judge()
+        self.misfit = NOTHING if curve is None else self._mismatch.judge(curve.place_words)
         limit = self.settings.real('mismatch_limit')
         share = abs(self.misfit.score) / limit
         if not self.sentence and share > 1.0:
-            self.sentence = _sentence(self.misfit, limit)
+            self.sentence = f'The model no longer fits: {self.misfit.hint}.'
             self._want(self.sentence)
             return [self._journal(JournalKind.MISMATCH, 0, '', self.sentence)]
         if self.sentence and share < _RETURN:
@@ -314,15 +313,6 @@ class DiagnosisRequests:
             return None
         self._pending = None
         return task
-
-
-def _sentence(misfit: Misfit, limit: float) -> str:
-    """Return a sentence on why the model no longer fits."""
-    size = math.floor(10.0 * abs(misfit.score)) / 10.0
-    return (
-        f'The model no longer fits: {misfit.hint} (statistic: {misfit.name}, '
-        f'{size:g} standard errors, limit {limit:g}).'
-    )
 
 
 def _onset_ns(content: str) -> int | None:

@@ -15,6 +15,7 @@ record (`valveflow_ros.diagnosis`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -313,14 +314,14 @@ class Mismatch(Memory):
         factor = (8.0 * n + 1.0) / (8.0 * n + 3.0)
         return np.asarray(np.sign(t) * factor * np.sqrt(n * np.log1p(t * t / n)))
 
-    def judge(self) -> Misfit:
+    def judge(self, place: Callable[[float], str] = 'u = {:.0f}'.format) -> Misfit:
         """Return the largest statistic."""
         scores = self.scores()
         j = int(np.argmax(np.abs(scores)))
         if scores[j] == 0.0:
             return NOTHING
         effect = self._estimates()[0][j] * self._size()[j]
-        return Misfit(float(scores[j]), NAMES[j], self._hint(j, float(effect)))
+        return Misfit(float(scores[j]), NAMES[j], self._hint(j, float(effect), place))
 
     def _size(self) -> FloatArray:
         """Return the root mean square of each regressor."""
@@ -347,23 +348,25 @@ class Mismatch(Memory):
         spread = np.where(there, np.sqrt(variance + floor**2), 0.0)
         return theta, spread, np.where(there, q**2 / np.where(there, qq, 1.0), 0.0)
 
-    def _hint(self, j: int, effect: float) -> str:
+    def _hint(self, j: int, effect: float, place: Callable[[float], str]) -> str:
         """Return the meaning of a statistic in words; ``effect`` in MW."""
         size, side = f'{abs(effect):.2g} MW', 'more' if effect > 0.0 else 'less'
         if j >= BIN:
             low, high = self._ends
             at = low + (high - low) * (j - BIN) / (BINS - 1)
-            return f'around u = {at:.0f} the unit gives {size} {side} than it says'
+            return f'at about {place(at)} the unit gives {size} {side} than the model predicts'
         if j >= MOVE:
-            return f'in the minutes after a move the power is off by {size}'
+            return f'in the minutes after a move of the valve the power differs by {size}'
         if j in (LAG_LOW, LAG_HIGH):
-            how = 'faster' if effect > 0.0 else 'slower'
-            return f'the power follows moves {how} at {"low" if j == LAG_LOW else "high"} load'
+            how = 'faster' if effect > 0.0 else 'more slowly'
+            load = 'low' if j == LAG_LOW else 'high'
+            return f'at {load} load the power follows the valve {how} than the model predicts'
         if j == DIRECTION:
-            return f'opening and closing to the same place differ by {2.0 * abs(effect):.2g} MW'
+            apart = f'{2.0 * abs(effect):.2g} MW'
+            return f'at the same opening the power differs by {apart} between opening and closing'
         return {
-            OFFSET: f'the unit gives {size} {side} than it says',
-            GAIN: f'the unit gives {size} {side}, in proportion to the load',
-            INPUT: f'the unit gives {size} {side} where the curve is steep',
-            TEMPERATURE: f'the power goes with the main steam temperature, by {size}',
-        }.get(j, f'the power swings with the time of day, by {size}')
+            OFFSET: f'the unit gives {size} {side} than the model predicts',
+            GAIN: f'the unit gives {size} {side} than the model predicts, in proportion to load',
+            INPUT: f'where the curve is steep it gives {size} {side} than the model predicts',
+            TEMPERATURE: f'the power changes with the main steam temperature, by {size}',
+        }.get(j, f'the power varies with the time of day, by {size}')

@@ -210,6 +210,8 @@ class ReferenceCurve:
             worn = self.curve is None or self.curve.model_id != self.first.model_id
             return self.first if worn else None
         after_ns = round(settings.real('reference_after') * _DAY_NS)
+        if not after_ns:
+            return None
         full_ns = round(_FULL * settings.real('window_days') * _DAY_NS)
         before = self._candidate
         if before is None or time_ns - before[0] >= after_ns:

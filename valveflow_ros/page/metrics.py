@@ -137,7 +137,7 @@ def _alarms(units: Named) -> Metric:
 
 def _levels(units: Named) -> Metric:
     found = GaugeMetricFamily(
-        'valveflow_health_level', 'Health of an item: 0 fine, 1 look at it, 2 fault, 3 silent.',
+        'valveflow_health_level', 'Health of an item: 0 OK, 1 WARN, 2 ERROR, 3 STALE.',
         labels=['unit', 'item'],
     )  # fmt: skip
     for name, unit in units:

@@ -104,8 +104,7 @@ def form_words(c: Characteristic) -> str:
     return (
         f'The breakpoints of this valve are at fixed openings: the power follows {mine} with c = '
         f'{decimals(c.offset_mw, 1)} MW. On held-out data the error of this form is '
-        f'{plain(form.rmse_mw, 2)} MW, that of {form.other} {plain(form.rmse_other_mw, 2)} MW '
-        f'(log-likelihood {form.log_likelihood_gain:+.0f}).'
+        f'{plain(form.rmse_mw, 2)} MW, that of {form.other} {plain(form.rmse_other_mw, 2)} MW.'
     )
 
 
@@ -428,7 +427,7 @@ def pieces_doubt(c: Characteristic) -> str:
     others = ', '.join(f'{j} of {_percent(p)}' for j, p in likely.items())
     return (
         f'The number of pieces is not certain: {len(c.pieces)} has a probability of {chosen}, '
-        f'{others}. The 95 % intervals of the breakpoints hold if it is right.'
+        f'{others}. The 95 % intervals of the breakpoints are valid only for the right number.'
     )
 
 

@@ -79,7 +79,7 @@ def diagnosis_page(data: Diagnosed) -> Page:
     """Return the report: the result and its figure first, then the four steps."""
     agree = 'Simulation and measurement agree'
     if _drifts(data.diagnosis):
-        agree = 'No cause found, but the power drifts'
+        agree = 'No cause found, but the power varies slowly'
     title = {NAMED: 'Why simulation and measurement disagree', NOTHING: agree}.get(
         data.diagnosis.verdict, 'Simulation and measurement disagree'
     )
@@ -224,7 +224,7 @@ def _proof(data: Diagnosed) -> Section:
         ]
     if d.segments:
         parts.append(segments_figure(d.segments))
-    return Section('4. The proof', parts)
+    return Section('4. Check on held-out data', parts)
 
 
 # Presentation of a diagnosis: names of variables, parameters, times as dates.
@@ -445,9 +445,10 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
     return Figure(
         f'map-{m.across.replace(" ", "-")}',
         f'<b>Residual over {text(_variable(m.across))} and {text(_variable(m.up))}</b>, '
-        'simulation left, extended model right. Only cells beyond chance are filled: '
+        'simulation left, extended model right. Only cells outside the 99 % band of random noise '
+        'are filled: '
         f'{m.shown_before} of {m.cells} for the simulation, {m.shown_after} for the extended '
         f'model; chance alone fills about {plain(0.01 * m.cells, 1)}.',
-        f'{m.shown_before} of {m.cells} cells are beyond chance before, {m.shown_after} after.',
+        f'{m.shown_before} of {m.cells} cells are outside it before, {m.shown_after} after.',
         traces, layout, height=380,
     )  # fmt: skip

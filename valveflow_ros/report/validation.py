@@ -102,10 +102,10 @@ def verdict_words(data: Validated) -> list[str]:
         _verdict(v),
         f'{counted(steady, "steady-state segment")} and '
         f'{counted(slope, "slope-response segment")} were judged; mean squared error '
-        f'{plain(j.mse(v.judged_by))} MW². A mean difference of zero stands in {worth} of '
-        f'{tested} segments (one independent value takes '
-        f'{duration(j.widening * v.trial.step_s)}), and in {each} if each sample is counted, '
-        'as the paper does.',
+        f'{plain(j.mse(v.judged_by))} MW². In {worth} of {tested} segments the mean difference '
+        'is not significantly different from zero (one independent value per '
+        f'{duration(j.widening * v.trial.step_s)}); in {each} if each sample is counted as '
+        'independent, as the paper does.',
     ]
     if v.gain is not None:
         theirs = OTHER + ('simulated' if OTHER + 'simulated' in v.predictions else 'curve')
@@ -136,18 +136,21 @@ def _verdict(v: Validation) -> str:
     tolerance = f'{v.tolerance_mw:.3g} MW'
     mean = f'over all segments {differs(v.overall)}'
     if v.verdict is Verdict.HOLDS:
-        return f'The characteristic holds: {mean}, and on each piece surely within {tolerance}.'
+        return (
+            f'The characteristic is valid: {mean}, and within {tolerance} on each piece, with '
+            '95 % confidence.'
+        )
     if v.misfit_beyond:
         return (
-            f'The characteristic is off by {misfit_words(v.misfit_beyond)}; {tolerance} are let '
-            f'pass. The mean {mean}.'
+            f'The characteristic is off by {misfit_words(v.misfit_beyond)}; the tolerance '
+            f'is {tolerance}. The mean {mean}.'
         )
     if v.verdict is Verdict.OFF:
         off = [c for c in (v.overall, *v.pieces) if c.beyond(v.tolerance_mw)]
         worst = max(off, key=lambda c: abs(c.test.mean))
         return (
             f'The characteristic is off: at u from {span(worst.u_from, worst.u_to)} '
-            f'{differs(worst)}, more than the {tolerance} that are let pass.'
+            f'{differs(worst)}, more than the tolerance of {tolerance}.'
         )
     real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
     which = 'For the mean over all segments'
@@ -160,9 +163,9 @@ def _verdict(v: Validation) -> str:
     size = math.sqrt(v.judgement.mse(v.judged_by))
     return (
         f'The measured power differs from the prediction by {plain(size, 2)} MW (root mean '
-        f'square); whether the characteristic holds stays open: {mean}{real}. {which} it cannot '
-        f'be told whether the difference is within {tolerance} or beyond. A longer log, with '
-        'every load in it, would help.'
+        f'square); it cannot be decided whether the characteristic is valid: {mean}{real}. '
+        f'{which} it cannot be told whether the difference is within {tolerance} or beyond. A '
+        'longer log, with every load in it, would help.'
     )
 
 

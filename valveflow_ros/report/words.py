@@ -242,13 +242,13 @@ def held_words(held: tuple[HeldCause, ...]) -> str:
     names = ', '.join(f'{h.name} ({values})' if values else h.name for h, values in told)
     if any(h.name in _FROM_THE_MEAN for h in held):
         curve = (
-            'A drift, and what comes and goes, is counted from its mean over the record it was '
-            'found in: the curve is that of this mean. '
+            'For a drift, and for a cause that switches on and off, only the deviation from its '
+            'mean is removed, so the curve contains the mean effect. '
         )
     else:
         curve = f'The curve is that of the unit without {"it" if len(held) == 1 else "them"}. '
     return (
-        f'Held, and taken out of opening and power before anything else: {names}. {curve}'
+        f'The effect of these known causes was removed from the data first: {names}. {curve}'
         + ' '.join(h.sentence for h in held)
     )
 

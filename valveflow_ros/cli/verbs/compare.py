@@ -28,7 +28,7 @@ Identify the flow characteristic in three ways - from special segments, as a Ham
 and by sparse identification - and judge all of them on data none has seen, as Section IV of
 the paper does: parameters, mean squared errors in special segments, paired t tests. DIR gets
 report.html for people, comparison.json and three tables for programs. Without --test
-the last third of the log is held back to judge by.
+the last third of the log is used for testing only.
 
 example:
   valveflow compare plant.mcap -o result --test other_days.mcap
@@ -45,7 +45,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.usage = 'valveflow compare LOG -o DIR [options]'
     add_analysis(parser, 'the log to learn from')
     parser.add_argument(
-        '--test', metavar='LOG2', type=Path, help='a log of other days to judge by'
+        '--test', metavar='LOG2', type=Path, help='a log of other days, for testing only'
     )
     parser.add_argument(
         '--truth', metavar='FILE', type=Path,

@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Write the inverse of a flow characteristic as a table: the input u of the curve that gives a
-demanded power, and at stated pressures the opening. Put before the valve, it makes the unit
-answer alike at every load. The knees of the curve are points of the table, so that linear
-interpolation is exact; what the table is good for, and where not, is said.
+demanded power, and for each --pressure the opening. Used in the controller before the valve,
+it makes the response of the unit equal at every load. The breakpoints of the curve are rows of
+the table, so that linear interpolation is exact. The command reports where the table must not
+be used.
 
-u is V p^m, V being the opening in % and p the pressure in MPa. Of a curve whose knees stand at
-fixed openings, p^m F(V) + c, u is the opening, and a table is for one pressure.
+u is V p^m, with the opening V in % and the pressure p in MPa. For a valve with breakpoints at
+fixed openings, p^m F(V) + c, u is the opening, and a table is valid for one pressure only.
 
 example:
   valveflow compensate --model result/characteristic.json -o table.csv --pressure 16.7"""

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from valveflow_ros.report.identified import Identified
 
 _DESCRIPTION = """\
-Find the flow characteristic of the valve in a log of ordinary operation: the moments in
-which the unit rests or moves along a ramp are searched out, and the best curve of straight
-pieces is put through them. DIR gets report.html for people and characteristic.json for
-programs. The step of the data is found by itself.
+Find the flow characteristic of the valve in a log of ordinary operation: steady states and
+steady ramps are selected, and a curve of straight pieces is fitted to them. DIR gets
+report.html for people and characteristic.json for programs. The sampling interval is found
+automatically.
 
 example:
   valveflow identify plant.mcap -o result

@@ -72,7 +72,7 @@ def arguments(parser: ArgumentParser) -> None:
     historian = parser.add_argument_group('history of an OPC UA server')
     historian.add_argument(
         '--mapping', metavar='FILE', type=Path,
-        help='which nodes are which signals, and how the server lets you in: docs/gateway.md',
+        help='OPC UA nodes of the signals and login of the server; see docs/tutorial_opcua.md',
     )  # fmt: skip
     historian.add_argument('--unit', metavar='TAG', help='which unit of several in that file')
     historian.add_argument(

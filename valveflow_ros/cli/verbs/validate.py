@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from valveflow_ros.report.validation import Validated
 
 _DESCRIPTION = """\
-Hold a characteristic against a log it was not made from: in each steady-state and
+Compare a characteristic with a log it was not made from: in each steady-state and
 slope-response segment of the log, how far is the measured power from the predicted one?
 Says whether the curve holds, is off (and on which piece), or cannot be told. DIR gets
 report.html for people, validation.json and segments.csv for programs.
@@ -38,7 +38,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow validate LOG --model FILE -o DIR [options]'
-    add_analysis(parser, 'the log to judge by')
+    add_analysis(parser, 'the log to compare with')
     parser.add_argument(
         '--model', metavar='FILE', type=Path, required=True,
         help='a characteristic.json of identify, or an extended_model.json of diagnose',

@@ -24,7 +24,7 @@ TO_DO = {
         'First ask whether the extraction or the first stage behind the valve is fouled: a '
         'pressure there that rose over the years gives the same picture. If the geometry '
         'explains it, nothing is broken: use the extended model, or log the pressure behind the '
-        'valve and hold it against `kappa`.'
+        'valve and compare it with `kappa`.'
     ),
     'clock': (
         'Compare the clocks of the two loggers, and turn on NTP or PTP on both. In a historian '
@@ -39,9 +39,9 @@ TO_DO = {
     ),
     'curve_shape': (
         'A bump where two valves overlap is a matter of their cams or of the table in the '
-        'controller: hold its place against the lift diagram. A dent means too little overlap. '
-        'It costs nothing but linearity; `valveflow compensate` gives a table for the '
-        'controller that takes the bend out.'
+        'controller: compare its position with the lift diagram. A dent means too little overlap. '
+        'It affects only the linearity; `valveflow compensate` gives a table for the '
+        'controller that removes the bend.'
     ),
     'curve_step': (
         'Look at the valve that opens at `u_from`: its lift, its servo, its linkage, the broken '
@@ -51,7 +51,7 @@ TO_DO = {
     ),
     'diurnal': (
         'Usually not a fault: cold cooling water in the night, warm in the afternoon. Log the '
-        'pressure in the condenser and see whether it carries the wave. If the amplitude grows '
+        'pressure in the condenser and see whether it has the same daily variation. If it grows '
         'from one year to the next, look at the condenser: air, fouling, the cooling tower.'
     ),
     'exponent': (
@@ -61,8 +61,8 @@ TO_DO = {
     ),
     'flatline': (
         'Look at the transmitter, at the input card and at the gateway, which may be repeating '
-        'its last value. The rows are masked, so the curve stays right; but a monitor whose '
-        'inputs are masked for long is `SUPPRESSED` and guards nothing.'
+        'its last value. Only the diagnosis leaves these rows out. A running monitor uses them: '
+        'repair the signal, then request a new curve (`~/refit`).'
     ),
     'gain_change': (
         'First ask whether the cooling water was as warm then. If it was, and the power fell: '
@@ -112,13 +112,13 @@ TO_DO = {
     ),
     'quantisation': (
         'Raise the resolution of the analogue card, or turn down the dead band (exception '
-        'deviation) of the historian for the four signals. Short ramps carry nothing when a '
-        'step is as large as they are.'
+        'deviation) of the historian for the four signals. A ramp that is smaller than one step '
+        'cannot be used.'
     ),
     'rate_limit': (
         'Look at oil pressure, filter and pump, at the servo valve and at friction in the stem. '
-        'The unit keeps its load but not its promise of primary frequency control: test the '
-        'answer to a step, and tell the grid operator if it falls short.'
+        'The unit reaches its load, but perhaps too slowly for primary frequency control: test '
+        'the response to a step, and tell the grid operator if it is too slow.'
     ),
     'region_lag': (
         'Usually not a fault but physics that the model did not have: more steam is stored '
@@ -132,13 +132,13 @@ TO_DO = {
     ),
     'saturation': (
         'Look for a limiter left in the controller, for a mechanical stop, or for a stem that '
-        'meets its end. Until it is mended the unit has less reserve than its operators '
-        'believe: tell them the opening named.'
+        'reaches its end stop. Until it is repaired the unit has less reserve than its '
+        'operators believe: tell them the opening named.'
     ),
     'spikes': (
         'Look for a loose terminal, a shield grounded at both ends, or a restart of the '
-        'gateway. The rows are masked. A rising number of them is worth a work order before the '
-        'signal is lost.'
+        'gateway. Only the diagnosis leaves these rows out. If their number rises, repair the '
+        'signal before it is lost.'
     ),
     'stiction': (
         'Lubricate, retighten or renew the packing; check the positioner and the oil. Do not '

@@ -98,8 +98,8 @@ def gain_drift_starts(screening: Screening) -> Sequence[Start]:
 def gain_drift_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
-        f'The power per flow drifts: {change(values["g"])} in ten days, at every load alike '
-        '(wear, efficiency, or the scale of the power meter).'
+        f'The power at the same flow changes evenly: {change(values["g"])} per ten days, at '
+        'every load (wear, efficiency, or the scale of the power meter).'
     )
 
 
@@ -170,8 +170,9 @@ def input_drift_starts(screening: Screening) -> Sequence[Start]:
 def input_drift_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
-        f'The same reading of opening and pressure passes {change(values["g"])} steam after ten '
-        'days (scale of the pressure or position transmitter, or wear of the seat).'
+        'At the same readings of opening and pressure the steam flow changes evenly: '
+        f'{change(values["g"])} per ten days (scale of the pressure or position transmitter, or '
+        'wear of the seat).'
     )
 
 
@@ -391,7 +392,7 @@ def diurnal_starts(screening: Screening) -> Sequence[Start]:
 def diurnal_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
-        f'The power swings by ±{100.0 * abs(values["a"]):.2g} % every day, highest at '
+        f'The power varies by ±{100.0 * abs(values["a"]):.2g} % every day, highest at '
         f'{values["peak_h"] % 24.0:.1f} h UTC (condenser and cooling water follow the day).'
     )
 

@@ -144,8 +144,8 @@ def _fitted(screening: Screening, values: Values, base: RegionalModel) -> Start:
 def reheater_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
-        f'Only {100.0 * values["alpha"]:.0f} % of the power follow the valve at once; the rest '
-        f'comes {values["time_s"]:.3g} s later, through the reheater.'
+        f'Only {100.0 * values["alpha"]:.0f} % of the power follows the valve at once. The rest '
+        f'follows through the reheater, with a time constant of {values["time_s"]:.3g} s.'
     )
 
 

@@ -137,8 +137,9 @@ def simpler(values: Values) -> list[Values]:
 def stiction_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
-        f'The valve sticks and slips: it stays until pulled by {values["s_percent"]:.2g} % of '
-        f'opening and then jumps by {values["j_percent"]:.2g} %.'
+        'The valve sticks and slips: after a reversal it does not move until the demand has '
+        f'changed by {values["s_percent"]:.2g} % of opening, then it jumps by '
+        f'{values["j_percent"]:.2g} %.'
     )
 
 

@@ -148,7 +148,7 @@ def starts_days(values: Values) -> float:
 
 SPIKES = Effect(
     'spikes',
-    'A recorded signal has single wild values.',
+    'A recorded signal has single outliers.',
     (
         SIGNAL,
         Parameter('height', 20.0, "the signal's", 'Height, up or down.', 0.0, 1e4),

@@ -446,14 +446,14 @@ def reference_item(monitor: Monitor) -> Item:
     reference = monitor.reference
     if reference.curve is None:
         sentence = (
-            'There is no reference yet: a curve becomes the reference if nothing was wrong during '
-            'reference_after before it, or by ~/set_reference.'
+            'There is no reference curve yet. A curve becomes the reference after reference_after '
+            'days without a fault, or when ~/set_reference is called.'
         )
         return Item('reference', Level.OK, sentence)
     shift = reference.shift
     values: dict[str, object] = {
         'Reference': reference.curve.model_id,
-        'Something is wrong since (s since 1970)': (
+        'Fault since (s since 1970)': (
             None if reference.fault_ns is None else reference.fault_ns // 10**9
         ),
         'Wear (MW a month)': None if reference.wear is None else reference.wear.mw_per_month,
@@ -473,11 +473,14 @@ def reference_item(monitor: Monitor) -> Item:
     # After a restart the alarm may be active although no curve was compared yet.
     sentence = 'The next curve is judged against it.' if shift is None else shift.sentence
     if reference.alarm.active and (shift is None or not shift.moved):
-        spans = ' and '.join(f'u {a:.0f} to {b:.0f}' for a, b in reference.alarm.ranges)
-        moved = f'what moved, {spans}, is not judged unmoved yet' if spans else 'doubt is left'
-        sentence = f'The alarm stands: {moved}. {sentence}'
+        spans = ' and '.join(reference.curve.place_words(*r) for r in reference.alarm.ranges)
+        why = (
+            f'no later curve has confirmed the reference at {spans}' if spans
+            else 'the last curve is too uncertain to clear it'
+        )  # fmt: skip
+        sentence = f'The alarm is still active: {why}. {sentence}'
     elif suspected and not reference.alarm.active:
-        sentence += ' It is an alarm if the next curve shows it too.'
+        sentence += ' An alarm is raised if the next curve shows it too.'
     return Item('reference', level, sentence, values)
 
 
@@ -512,7 +515,7 @@ def model_item(monitor: Monitor) -> Item:
     """Return the item that says whether the model still fits the data."""
     diagnosing = monitor.diagnosing
     values: dict[str, object] = {
-        'Loudest statistic': diagnosing.misfit.name,
+        'Largest deviation': diagnosing.misfit.name,
         'Its distance from zero (standard errors)': diagnosing.misfit.score,
         'Limit (standard errors)': monitor.settings.real('mismatch_limit'),
     }
