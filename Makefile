@@ -89,11 +89,11 @@ torture: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) python -m benchmarks.thermal_study --recording minute --seeds 100 --first 101 \
+	@$(ENV) python -m benchmarks.thermal_study --recording minute --seeds 100 --first 701 \
 	  --kinds choked,sequence,integrated_input
-	@$(ENV) python -m benchmarks.thermal_study --recording 1s --seeds 10 --first 101 \
+	@$(ENV) python -m benchmarks.thermal_study --recording 1s --seeds 30 --first 701 \
 	  --kinds choked,sequence,integrated_input
-	@$(ENV) python -m benchmarks.thermal_study --recording compressed --seeds 30 --first 101 \
+	@$(ENV) python -m benchmarks.thermal_study --recording compressed --seeds 30 --first 701 \
 	  --kinds choked,sequence,integrated_input
 
 study-diagnosis: setup

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.cause import FittedCause
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnose import Record
 from valveflow_ros.diagnosis.evidence import colour, rmse
@@ -56,11 +56,11 @@ def oracle(
     return Oracle(available, rmse(task, model, grids.sealed_rows))
 
 
-def _active(spec: EffectSpec) -> Active | None:
+def _active(spec: EffectSpec) -> FittedCause | None:
     cause = catalogue().get(spec.name)
     if cause is None or cause.infer is not None:
         return None
-    return Active(cause, tuple(float(spec.parameters[u.name]) for u in cause.unknowns))
+    return FittedCause(cause, tuple(float(spec.parameters[u.name]) for u in cause.unknowns))
 
 
 def _others(task: Task, model: Extended) -> tuple[Extended, float]:

@@ -118,8 +118,8 @@ def _numbers(name: str) -> str:
 def _others(name: str) -> str:
     if name in FAULTS:
         return (
-            'It is a fault of the record, not of the plant: the values are not believed, and '
-            'no model is extended by it.'
+            'It is a fault of the record, not of the plant: the diagnosis leaves the values out, '
+            'and no model is extended by it.'
         )
     cause = causes.catalogue()[name]
     links = ', '.join(f'[{n}]({n}.md)' for n in cause.confusers)

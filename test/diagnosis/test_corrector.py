@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from streams import needs_jit
 from test_diagnosis_parts import TYPICAL
 
-from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.cause import FittedCause
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
@@ -42,9 +42,9 @@ def grids(rows):
     return make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
 
 
-def active(name: str) -> Active:
+def active(name: str) -> FittedCause:
     extra = (3600.0, 9000.0, 20_000.0) if name == 'intervals' else ()
-    return Active(catalogue()[name], VALUES[name], extra)
+    return FittedCause(catalogue()[name], VALUES[name], extra)
 
 
 def model_of(grids, *names: str) -> ExtendedModel:

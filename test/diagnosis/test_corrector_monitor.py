@@ -16,11 +16,11 @@ from streams import needs_jit
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
-from valveflow_ros.diagnosis.cause import Active
+from valveflow_ros.diagnosis.cause import FittedCause
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
-from valveflow_ros.diagnosis.from_window import freed, on_top
+from valveflow_ros.diagnosis.from_window import on_top, without_causes
 from valveflow_ros.diagnosis.grids import make_grids
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
@@ -43,7 +43,7 @@ HELD = {'backlash': (0.8,), 'exponent': (0.03,), 'gain_step': (0.02, 0.2), 'rehe
 
 def model_of(rows: SampleTable, held: dict[str, tuple[float, ...]]) -> ExtendedModel:
     grids = make_grids(*record(rows).about, np.zeros(rows.values.shape, dtype=bool))
-    active = tuple(Active(catalogue()[n], v) for n, v in held.items())
+    active = tuple(FittedCause(catalogue()[n], v) for n, v in held.items())
     return ExtendedModel(
         Extended(rough_model(), active),
         StaticForm(exponent=EXPONENT),
@@ -193,8 +193,8 @@ def test_an_opening_that_a_held_stop_lets_rest_is_no_fault_of_its_signal(rows):
     corrector = corrector_of(model, STEP_S)
     rests = record(corrector.correct(rows))
     assert not rests.faults()[1]  # its largest value is a stop, held or not
-    assert not freed(rests, corrector.held).faults()[1]
-    assert freed(rests, ()) is rests
+    assert not without_causes(rests, corrector.held).faults()[1]
+    assert without_causes(rests, ()) is rests
     assert not on_top(rests, model, rows).faults()[1]
 
 

@@ -59,7 +59,7 @@ def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth, a
     assert found.rmse_noise_floor <= found.rmse_extended
     assert cause.to_do
     found_mw = re.fullmatch(
-        r'At full load \(from \d+ MW on\) it is ([\d.]+) MW (more|less)\b.*', cause.meaning
+        r'At full load \(from \d+ MW on\) this makes ([\d.]+) MW (more|less)\b.*', cause.meaning
     )
     assert bool(found_mw) == (at_full_load_mw is not None)
     if found_mw:

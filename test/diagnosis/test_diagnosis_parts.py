@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from streams import needs_jit
 
 from valveflow_ros.diagnosis import kernels, record_faults
-from valveflow_ros.diagnosis.cause import Active, SentenceValues, Stage
+from valveflow_ros.diagnosis.cause import FittedCause, SentenceValues, Stage
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import sign_flip
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
@@ -69,7 +69,7 @@ def test_every_cause_changes_the_answer_and_nothing_is_nothing(grids, name):
     plain = Extended(rough_model())
     cause = catalogue()[name]
     extra = (3600.0, 9000.0) if name == 'intervals' else ()
-    changed = answer(grids, plain.with_cause(Active(cause, TYPICAL[name], extra)))
+    changed = answer(grids, plain.with_cause(FittedCause(cause, TYPICAL[name], extra)))
     assert np.isfinite(changed).all()
     assert np.abs(changed - answer(grids, plain))[grids.scored].max() > 1e-3
 
@@ -84,13 +84,13 @@ def test_tangents_of_causes_predict_small_changes(grids, name):
     model = replace(
         rough_model(), levels=np.empty(0), time_constants=np.array([20.0]), delays=np.array([4.0])
     )
-    here = Extended(model, (Active(cause, TYPICAL[name], extra),))
+    here = Extended(model, (FittedCause(cause, TYPICAL[name], extra),))
     task = Task(grids, grids.whole, np.zeros(ORDER))
     tangent = cause_tangents(task, here)[:, 0]
     values = list(TYPICAL[name])
     by = 0.3 * cause.unknowns[0].step
     values[0] += by
-    moved = answer(grids, Extended(model, (Active(cause, tuple(values), extra),)))
+    moved = answer(grids, Extended(model, (FittedCause(cause, tuple(values), extra),)))
     change = moved - answer(grids, here)
     assert np.abs(change - by * tangent).max() <= 0.1 * np.abs(change).max() + 1e-9
 
@@ -122,7 +122,9 @@ def test_places_on_the_curve_are_in_the_unit_of_its_axis(grids, name):
             other.act(opening.u, on_opening(size), opening), one.act(grids.u, size, grids),
             atol=1e-9,
         )  # fmt: skip
-        model = Extended(replace(rough_model(), offset_mw=0.0), (Active(other, on_opening(size)),))
+        model = Extended(
+            replace(rough_model(), offset_mw=0.0), (FittedCause(other, on_opening(size)),)
+        )
         kept = model_to_json(ExtendedModel(model, opening.form, 5, grids.reference))
         assert model_from_json(kept).model.active == model.active
 
@@ -255,8 +257,8 @@ def test_a_jump_stays_in_whatever_unit_the_curve_is(unit_of_curve):
 def test_the_extended_model_comes_back_from_its_file(grids):
     model = Extended(
         rough_model(),
-        (Active(catalogue()['gain_step'], (0.006, 0.2)),
-         Active(catalogue()['intervals'], (0.01,), (3600.0, 9000.0))),
+        (FittedCause(catalogue()['gain_step'], (0.006, 0.2)),
+         FittedCause(catalogue()['intervals'], (0.01,), (3600.0, 9000.0))),
     )  # fmt: skip
     raw = json.loads(
         json.dumps(model_to_json(ExtendedModel(model, StaticForm(), 5, grids.reference)))
@@ -270,7 +272,7 @@ def test_the_extended_model_comes_back_from_its_file(grids):
 
 def test_a_model_of_the_first_version_is_read_unless_a_step_is_in_it(grids):
     for name, values, old in (('gain_drift', (0.01,), True), ('gain_step', (0.01, 0.2), False)):
-        model = Extended(rough_model(), (Active(catalogue()[name], values),))
+        model = Extended(rough_model(), (FittedCause(catalogue()[name], values),))
         raw = model_to_json(ExtendedModel(model, StaticForm(), 5, grids.reference))
         assert model_from_json(raw).model.names == (name,)
         with nullcontext() if old else pytest.raises(DataError, match='Make it anew'):

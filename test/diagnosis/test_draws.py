@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import needs_jit
 
-from valveflow_ros.diagnosis.cause import Active, Kind
+from valveflow_ros.diagnosis.cause import FittedCause, Kind
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task, beliefs, free, held, whitening
@@ -72,8 +72,8 @@ def sticking():
 
 def test_believed_draws_predict_better_than_their_mean_and_than_a_slack(sticking):
     task, plain = sticking
-    drawn = plain.with_cause(Active(catalogue()['stiction'], STICKS))
-    slack = plain.with_cause(Active(catalogue()['backlash'], (STICKS[0],)))
+    drawn = plain.with_cause(FittedCause(catalogue()['stiction'], STICKS))
+    slack = plain.with_cause(FittedCause(catalogue()['backlash'], (STICKS[0],)))
     mean = np.mean((task.grids.power - answer(task.grids, drawn))[task.rows] ** 2)
     believed = np.mean(task.residual(drawn)[task.rows] ** 2)
     assert believed < mean
@@ -83,7 +83,7 @@ def test_believed_draws_predict_better_than_their_mean_and_than_a_slack(sticking
 
 def test_held_draws_say_nearly_the_same_and_come_free_again(sticking):
     task, plain = sticking
-    drawn = plain.with_cause(Active(catalogue()['stiction'], STICKS))
+    drawn = plain.with_cause(FittedCause(catalogue()['stiction'], STICKS))
     fixed = held(task.grids, drawn, task.ar)
     (active,) = fixed.active
     assert active.values == STICKS

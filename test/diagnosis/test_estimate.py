@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, dates
+from valveflow_ros.diagnosis.cause import DAY_S, Estimate, FittedCause, dates
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import Gain
 from valveflow_ros.diagnosis.result import NamedCause, cause_json
@@ -72,7 +72,7 @@ def test_what_is_no_time_has_no_date():
 
 @pytest.mark.parametrize('name', STEPS)
 def test_a_sentence_says_when_by_the_calendar(name):
-    active = Active(catalogue()[name], STEPS[name])
+    active = FittedCause(catalogue()[name], STEPS[name])
     known = {n: Estimate(v, v - 0.01, v + 0.01, '') for n, v in active.named().items()}
     known['t0_days'] = onset(3.4, 3.7)
     told = active.sentence(ORIGIN_NS, known)

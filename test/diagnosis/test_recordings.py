@@ -13,7 +13,7 @@ from streams import needs_jit
 
 import valveflow_ros as vf
 from valveflow_ros.diagnosis import record_faults
-from valveflow_ros.diagnosis.cause import Active, Estimate
+from valveflow_ros.diagnosis.cause import Estimate, FittedCause
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.grids import Blur, Grids, blur_of
 from valveflow_ros.diagnosis.loop import actuator
@@ -46,7 +46,7 @@ def test_fine_rows_hide_nothing(grids: Grids) -> None:
     assert grids.blur == Blur() == blur_of(np.arange(9.0), 19.9, None)
     for name, cause in catalogue().items():
         assert unseen(name, grids) == ''
-        assert hidden(Active(cause, (0.1,) * len(cause.unknowns)), grids) == ''
+        assert hidden(FittedCause(cause, (0.1,) * len(cause.unknowns)), grids) == ''
 
 
 @pytest.mark.parametrize('step_s', [20.0, 60.0, 300.0])
@@ -61,16 +61,16 @@ def test_a_coarse_step_hides_what_is_shorter(grids: Grids, step_s: float) -> Non
             (*(f * step_s if k == 'time' else v for k, v in zip(keys(name), values, strict=True)),)
             for f in (0.9, 1.1)
         )
-        assert hidden(Active(catalogue()[name], short), coarse).startswith(
+        assert hidden(FittedCause(catalogue()[name], short), coarse).startswith(
             f'cannot be judged at this sampling: rows {step_s:g} s apart hide lags and delays'
         )
-        assert hidden(Active(catalogue()[name], long), coarse) == ''
+        assert hidden(FittedCause(catalogue()[name], long), coarse) == ''
     for name in SLACK:
-        assert hidden(Active(catalogue()[name], (0.59, 0.5)[: len(SLACK[name])]), coarse)
-        assert not hidden(Active(catalogue()[name], (0.61, 0.5)[: len(SLACK[name])]), coarse)
-    assert hidden(Active(catalogue()['rate_limit'], (0.61 / step_s,)), coarse)
-    assert not hidden(Active(catalogue()['rate_limit'], (0.59 / step_s,)), coarse)
-    assert not hidden(Active(catalogue()['gain_drift'], (0.01,)), coarse)
+        assert hidden(FittedCause(catalogue()[name], (0.59, 0.5)[: len(SLACK[name])]), coarse)
+        assert not hidden(FittedCause(catalogue()[name], (0.61, 0.5)[: len(SLACK[name])]), coarse)
+    assert hidden(FittedCause(catalogue()['rate_limit'], (0.61 / step_s,)), coarse)
+    assert not hidden(FittedCause(catalogue()['rate_limit'], (0.59 / step_s,)), coarse)
+    assert not hidden(FittedCause(catalogue()['gain_drift'], (0.01,)), coarse)
 
 
 def keys(name: str) -> list[str]:
@@ -82,12 +82,12 @@ def test_a_compressed_log_hides_half_its_interval(grids: Grids) -> None:
     held = replace(grids, blur=blur_of(grids.v, 10.0, compression(54.0)))
     assert held.blur.time_s == 27.0
     assert held.blur.opening_percent >= 2.0
-    why = hidden(Active(catalogue()['clock'], (26.0,)), held)
+    why = hidden(FittedCause(catalogue()['clock'], (26.0,)), held)
     assert why == (
         'cannot be judged: values of this compressed log are typically 54 s apart, which hides '
         'lags and delays below 27 s'
     )
-    assert hidden(Active(catalogue()['clock'], (28.0,)), held) == ''
+    assert hidden(FittedCause(catalogue()['clock'], (28.0,)), held) == ''
     assert 'compressed' in actuator.hindered(replace(held, command=held.v + 1.0))
 
 
@@ -137,7 +137,7 @@ def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]
 
 def test_a_lag_that_its_error_exceeds_is_not_told() -> None:
     """The values stay in the parameters; the sentence does not tell them."""
-    lag = Active(catalogue()['region_lag'], (30.0, 5.0, 250.0))
+    lag = FittedCause(catalogue()['region_lag'], (30.0, 5.0, 250.0))
     bounds = {'time_s': (25.0, 35.0), 'delay_s': (-6.0, 16.0), 'level_mw': (240.0, 260.0)}
     told = {name: Estimate(lag.named()[name], *ends, 's') for name, ends in bounds.items()}
     said = lag.sentence(0, told)

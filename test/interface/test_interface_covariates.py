@@ -96,7 +96,7 @@ def test_without_the_column_a_drift_is_told(plant, without):
     apart = frame[COLUMN] - line(frame['generated_power_mw'])
     assert slow.drift_mw == pytest.approx(abs(truth(plant)) * apart.std(), rel=0.3)
     assert (
-        f'The power drifts by {slow.drift_mw:.2g} MW over days, which has no' in without.sentence
+        f'The power varies slowly over days, by about {slow.drift_mw:.2g} MW,' in without.sentence
     )
     if without.verdict == 'nothing':
         assert 'down to a slow disturbance and its noise' in without.sentence

@@ -7,13 +7,13 @@ from __future__ import annotations
 import pytest
 from monitor_recording import START_NS, stamp
 
-from valveflow_ros.report.terminal.board import AGE, HEALTH, KEPT, Board
+from valveflow_ros.report.terminal.board import AGE, HEALTH, KEPT, MonitorState
 
 SECOND = 10**9
 
 
 def test_memory_is_bounded():
-    board = Board()
+    board = MonitorState()
     for k in range(3 * KEPT):
         board.take('valveflow_msgs/msg/Prediction', {
             'header': {'stamp': stamp(START_NS + k * SECOND), 'frame_id': 'U1'}, 'state': 2,
@@ -42,7 +42,7 @@ def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early, prefi
             'causes': [],
         })  # fmt: skip
 
-    board = Board()
+    board = MonitorState()
     if early:
         # Which monitor of several it is, is not known yet.
         health('U2', 3, 'silent')
@@ -58,14 +58,14 @@ def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early, prefi
 
 
 def test_what_bears_no_tag_is_no_units_before_one_is_known():
-    board = Board()
+    board = MonitorState()
     item = {'name': 'pump: state', 'hardware_id': '', 'level': 2, 'message': 'Too hot.'}
     board.take(HEALTH, {'header': {'frame_id': ''}, 'status': [item]})
     assert board.items == ()
 
 
 def test_what_others_say_of_the_same_device_is_left_alone():
-    board = Board()
+    board = MonitorState()
     said = {'hardware_id': 'U1', 'level': 2, 'message': 'Too hot.'}
     names = ('pump_node: temperature', 'pump_node: recorders', 'recorder of the pump')
     status = [{**said, 'name': name} for name in names]
@@ -76,7 +76,7 @@ def test_what_others_say_of_the_same_device_is_left_alone():
 
 @pytest.mark.parametrize(('age', 'later_s'), [('431.5', 431.5), ('unknown', 0.0), ('nan', 0.0)])
 def test_without_a_sample_the_health_tells_how_old_the_curve_is(age, later_s):
-    board = Board()
+    board = MonitorState()
     board.take('valveflow_msgs/msg/FlowCharacteristic', {
         'header': {'stamp': stamp(START_NS), 'frame_id': 'U1'}, 'breakpoints': [1.0, 2.0],
         'values': [1.0, 2.0], 'status': 1, 'cause': '', 'model_id': 'a', 'samples': 9,

@@ -412,7 +412,7 @@ def test_a_failure_gets_into_the_log_however_short_it_is_and_not_again_and_again
 WORK = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
 WORKER: Any = SimpleNamespace(failures_in_a_row=0, busy_s=None, starts=1)
 STRAIGHT = f'{NOT_REFINED}one straight piece, without dynamics.'
-ALONE = 'Piece 1 (u 1000 to 1400) rests on no special sample.'
+ALONE = 'Piece 1 (u 1000 to 1400) has no data in special segments, so its slope is uncertain.'
 
 
 @pytest.fixture(scope='module')

@@ -165,7 +165,7 @@ def test_a_run_with_references_is_repeated_byte_for_byte(curve: Characteristic) 
 
 def test_health_says_how_the_curve_stands_to_its_reference(curve: Characteristic) -> None:
     monitor = Monitor(SETTINGS)
-    assert 'There is no reference yet' in reference_item(monitor).sentence
+    assert 'There is no reference curve yet' in reference_item(monitor).sentence
     monitor.set_reference(lifted(curve, 5.0))
     assert 'The next curve is judged' in reference_item(monitor).sentence
     feed_rows(monitor, TABLE)

@@ -377,11 +377,11 @@ def judge(trial: Trial, predictions: Mapping[str, FloatArray]) -> Judgement:
 
 def _nothing_judged(trial: Trial) -> str:
     if not len(trial.spans):
-        return 'The data to judge by hold no special segment.'
+        return 'The test data hold no special segment.'
     rows = np.concatenate([np.arange(a, b) for a, b, _ in trial.spans])
     low, high = float(trial.u[rows].min()), float(trial.u[rows].max())
     return (
-        f'No special segment of the data to judge by can be judged: their u lies from {low:.4g} '
+        f'No special segment of the test data can be judged: their u lies from {low:.4g} '
         f'to {high:.4g}, beyond what the curve is known for, or they follow a gap too closely.'
     )
 

@@ -262,7 +262,7 @@ class Cause:
     hindered: Callable[[Grids], str] = field(default=lambda grids: '')
     slow: bool = False  # can be confused with a slow disturbance of the power
     # Estimates the hidden state (``extra``) from the allowed sub-blocks, for a given size.
-    infer: Callable[[Any, Active, BoolArray], Values] | None = None
+    infer: Callable[[Any, FittedCause, BoolArray], Values] | None = None
     of_model: bool = False  # a free identification may include it in the model
     order: int = 0  # order among causes of one stage: from the actuator to the plug
     # Number of simulated noise paths, and the ``act`` of a single one; see `fitting.beliefs`.
@@ -288,7 +288,7 @@ class Cause:
 
 
 @dataclass(frozen=True, slots=True)
-class Active:
+class FittedCause:
     """A cause with parameter values, as part of an extended model."""
 
     cause: Cause

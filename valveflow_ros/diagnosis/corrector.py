@@ -27,7 +27,7 @@ import numpy as np
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.curve.regional_model import RegionalModel, make_taps
 from valveflow_ros.diagnosis import kernels
-from valveflow_ros.diagnosis.cause import Active, Stage
+from valveflow_ros.diagnosis.cause import FittedCause, Stage
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, acts_on_scale
 from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.errors import DataError
@@ -72,7 +72,7 @@ class Valve(Protocol):
 class Stop(Memory):
     """A saturation, or any cause of the opening without a memory."""
 
-    def __init__(self, active: Active, reference: Reference) -> None:
+    def __init__(self, active: FittedCause, reference: Reference) -> None:
         del reference
         self._active = active
 
@@ -87,7 +87,7 @@ class Slack(Memory):
 
     REMEMBERED = ('_state',)
 
-    def __init__(self, active: Active, reference: Reference) -> None:
+    def __init__(self, active: FittedCause, reference: Reference) -> None:
         del reference
         self._half = 0.5 * active.values[0]
         self._state = np.full(1, np.nan)
@@ -105,7 +105,7 @@ class SlowServo(Memory):
 
     REMEMBERED = ('_state', '_last_ns')
 
-    def __init__(self, active: Active, reference: Reference) -> None:
+    def __init__(self, active: FittedCause, reference: Reference) -> None:
         del reference
         self._rate = active.values[0]
         self._state, self._last_ns = np.full(1, np.nan), np.zeros(1, dtype=np.int64)
@@ -127,7 +127,7 @@ class Sticking:
     measured power would enter its own prediction.
     """
 
-    def __init__(self, active: Active, reference: Reference) -> None:
+    def __init__(self, active: FittedCause, reference: Reference) -> None:
         self._band, self._jump = active.values[0], min(active.values[1], active.values[0])
         self._noise = reference.opening_noise
         self._state = np.full(_DRAWS, np.nan)
@@ -178,7 +178,7 @@ class Response(Memory):
 class Reheater(Response):
     """A reheater before part of the turbine: a fraction of the power has one more lag."""
 
-    def __init__(self, active: Active, step_s: float) -> None:
+    def __init__(self, active: FittedCause, step_s: float) -> None:
         share, time_s = active.values
         super().__init__(np.empty(0), make_taps(np.array([time_s]), np.zeros(1), step_s), 3)
         self._share = share
@@ -206,7 +206,7 @@ class LateClock(Memory):
         return out
 
 
-_VALVES: dict[str, Callable[[Active, Reference], Valve]] = {
+_VALVES: dict[str, Callable[[FittedCause, Reference], Valve]] = {
     'backlash': Slack,
     'stiction': Sticking,
     'rate_limit': SlowServo,
@@ -216,12 +216,12 @@ REHEATER, CLOCK = 'reheater', 'clock'
 _SHOWN = {REHEATER, CLOCK, 'output_offset_drift'}
 
 
-def valves(chain: tuple[Active, ...], reference: Reference) -> list[Valve]:
+def valves(chain: tuple[FittedCause, ...], reference: Reference) -> list[Valve]:
     """Return the streaming versions of the causes of the opening, from actuator to plug."""
     return [_VALVES[a.name](a, reference) for a in sorted(chain, key=lambda a: a.cause.order)]
 
 
-def check_streams(active: tuple[Active, ...]) -> None:
+def check_streams(active: tuple[FittedCause, ...]) -> None:
     """Raise if a cause has no streaming version here.
 
     Raises
@@ -444,7 +444,7 @@ class ModelCorrector(Memory):
         y[:n] -= self._plain.feed(plain[:n], begin)
         return y
 
-    def _show(self, a: Active, y: FloatArray, grids: Grids, begin: ByteArray) -> FloatArray:
+    def _show(self, a: FittedCause, y: FloatArray, grids: Grids, begin: ByteArray) -> FloatArray:
         if a.name not in self._reheaters:
             return np.asarray(a.cause.act(y, a.values, grids))
         out = y.copy()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import DAY_S, Active, Estimate, SentenceValues, told
+from valveflow_ros.diagnosis.cause import DAY_S, Estimate, FittedCause, SentenceValues, told
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.causes.curve import either_bend_sentence
 from valveflow_ros.diagnosis.causes.since_model import Change, since_model
@@ -46,7 +46,7 @@ from valveflow_ros.diagnosis.result import (
     NamedCause,
 )
 from valveflow_ros.diagnosis.screening import Screening
-from valveflow_ros.diagnosis.search import Found, Progress, other_bend, search, simplified
+from valveflow_ros.diagnosis.search import Progress, SearchResult, other_bend, search, simplified
 from valveflow_ros.diagnosis.slow import (
     LEAST_DRIFT_MW,
     NAMED_SHAPE,
@@ -68,7 +68,7 @@ from valveflow_ros.signals.static_form import StaticForm
 # fitted, confirm it at the 5 % level, corrected for the number of causes tried.
 
 
-def confirm(found: Found) -> None:
+def confirm(found: SearchResult) -> None:
     """Remove causes that the sealed blocks do not confirm, the least likely first."""
     while found.model.active:
         gains = gains_of(found, steps(found))
@@ -85,7 +85,7 @@ def confirm(found: Found) -> None:
         )
 
 
-def steps(found: Found) -> list[Extended]:
+def steps(found: SearchResult) -> list[Extended]:
     """Return the models with one more cause each, fitted to the open blocks."""
     models = [found.plain]
     for k in range(1, len(found.model.active)):
@@ -94,7 +94,7 @@ def steps(found: Found) -> list[Extended]:
     return models + ([found.model] if found.model.active else [])
 
 
-def gains_of(found: Found, models: list[Extended]) -> list[Gain]:
+def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
     """Return the gain of each cause on the sealed blocks over the model with the earlier ones."""
     return [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
 
@@ -105,7 +105,7 @@ _BETWEEN = 'Between the commanded and the measured opening: '
 _SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening is taken up.'
 
 
-def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
+def actuator_cause(found: SearchResult) -> tuple[NamedCause, ...]:
     """Return the fault between command and position sensor, with its size in MW of power."""
     grids = found.task.grids
     fault = actuator.judge(grids)
@@ -136,7 +136,7 @@ def actuator_cause(found: Found) -> tuple[NamedCause, ...]:
 
 
 def record_causes(
-    raw: Grids | None, found: Found, wrong: tuple[Fault, ...]
+    raw: Grids | None, found: SearchResult, wrong: tuple[Fault, ...]
 ) -> tuple[NamedCause, ...]:
     """Return faults of the record as causes; "before" is the RMSE with the invalid rows."""
     if raw is None:
@@ -380,7 +380,7 @@ def _wandering(grids: Grids, screening: Screening, slow: Wander) -> FloatArray |
     return slow.level[grids.sub] * screening.here if slow.there else None
 
 
-def _look_again(found: Found) -> _Rest:
+def _look_again(found: SearchResult) -> _Rest:
     """Test the residual of the model with all causes."""
     screening = Screening(found.task, found.model)
     slow = wander(screening)
@@ -392,7 +392,7 @@ def _look_again(found: Found) -> _Rest:
     return _Rest(slow, left, period(found.task, found.model), slowly, own)
 
 
-def _course(found: Found) -> Course | None:
+def _course(found: SearchResult) -> Course | None:
     """Return the shape of a change in time that the causes do not explain; None if there is none.
 
     Causes in time are removed if another shape, or a slow disturbance without a shape, fits better
@@ -426,7 +426,7 @@ def _course(found: Found) -> Course | None:
 
 
 _OF_SHAPE = {
-    NO_SHAPE: 'the power wanders slowly all the time, which would look the same',
+    NO_SHAPE: 'the power varies slowly all the time, which would look the same',
     'drift': 'the power changes evenly in time, which fits better',
     'step': 'the power changes once, which fits better',
     'late drift': 'a drift that begins within the record fits better',
@@ -470,7 +470,7 @@ _COURSE_STEP_S = 3600
 _DAYS_FROM_H = 48.0
 
 
-def _dated(found: Found) -> Extended:
+def _dated(found: SearchResult) -> Extended:
     """Return the model with its onsets fitted to all blocks.
 
     The open blocks alone would place a change inside a sealed block at the wrong end of it. The
@@ -481,7 +481,7 @@ def _dated(found: Found) -> Extended:
     return search_onsets(every, found.model)
 
 
-def _own_misfit(found: Found, left: Structure) -> str:
+def _own_misfit(found: SearchResult, left: Structure) -> str:
     """Return a note on a structure error of the model that is too small to be a fault; else ''.
 
     A real area curve is smooth, a turbine has more than one lag, and means over a minute do not
@@ -496,7 +496,7 @@ def _own_misfit(found: Found, left: Structure) -> str:
     )
 
 
-def _withdraw_small(found: Found) -> None:
+def _withdraw_small(found: SearchResult) -> None:
     """Remove causes that explain no more than the usual error of a model of another record.
 
     Only with a given model whose form or recording is known to leave such an error.
@@ -523,7 +523,7 @@ def _own_size(task: Task) -> float:
     return _OWN_MISFIT * float(np.ptp(np.quantile(power, (0.005, 0.995))))
 
 
-def _withdraw(found: Found, rest: _Rest) -> _Rest:
+def _withdraw(found: SearchResult, rest: _Rest) -> _Rest:
     """Remove causes in time if the power has a slow disturbance throughout the record.
 
     A cause stays if it explains far more than that disturbance.
@@ -543,7 +543,7 @@ def _withdraw(found: Found, rest: _Rest) -> _Rest:
     return replace(rest, drift=drift(found.task, found.model))
 
 
-def _explained(found: Found, name: str) -> float:
+def _explained(found: SearchResult, name: str) -> float:
     """Return the reduction of the mean square of the residual by a cause, MW^2."""
     rows = found.task.rows
     without, _ = improve(found.task, found.model.without(name), 3)
@@ -551,7 +551,7 @@ def _explained(found: Found, name: str) -> float:
     return float(np.mean(more**2) - np.mean(left**2))
 
 
-def _final(found: Found) -> tuple[Task, Extended]:
+def _final(found: SearchResult) -> tuple[Task, Extended]:
     """Fit the extended model to all blocks, including the sealed ones."""
     task = replace(found.task, rows=found.task.grids.whole)
     model, cost = improve(task, found.model, _LAST_STEPS)
@@ -560,7 +560,7 @@ def _final(found: Found) -> tuple[Task, Extended]:
     return task, inferred(task, model, np.ones(task.grids.subs, dtype=bool))
 
 
-def _meaning(task: Task, model: Extended, cause: Active) -> str:
+def _meaning(task: Task, model: Extended, cause: FittedCause) -> str:
     """Return a sentence with the effect of a cause at full load, relative to the model without it.
 
     For a step this is the value after minus before, for a drift the end minus the beginning, for
@@ -588,7 +588,7 @@ def _meaning(task: Task, model: Extended, cause: Active) -> str:
 
 
 def _worth(
-    cause: Active, moved: FloatArray, day: FloatArray, onset: float | None, days: float
+    cause: FittedCause, moved: FloatArray, day: FloatArray, onset: float | None, days: float
 ) -> tuple[float, float]:
     """Return the signed MW of a cause (0 if it has both signs) and its largest size."""
     reach = float(np.quantile(np.abs(moved), 0.95))
@@ -609,8 +609,8 @@ def _worth(
 
 
 def _conclude(
-    record: Record, found: Found, rest: _Rest, wrong: tuple[Fault, ...], since: Change | str,
-    progress: Progress,
+    record: Record, found: SearchResult, rest: _Rest, wrong: tuple[Fault, ...],
+    since: Change | str, progress: Progress,
 ) -> Diagnosis:  # fmt: skip
     grids = found.task.grids
     models = steps(found)
@@ -663,7 +663,7 @@ def _conclude(
     return replace(result, sentence=_sentence(result))
 
 
-def _other_bend(task: Task, final: Extended, found: Found) -> dict[str, Estimate]:
+def _other_bend(task: Task, final: Extended, found: SearchResult) -> dict[str, Estimate]:
     """Return the bend of opposite sign, fitted to all blocks; empty if there is none to report."""
     other = found.other_bend
     if other is None or 'curve_shape' not in final.names:
@@ -685,7 +685,7 @@ def _either(one: dict[str, Estimate], other: dict[str, Estimate]) -> dict[str, E
     }  # fmt: skip
 
 
-def _verdict(found: Found, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
+def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
     """Return the verdict, and whether the names must be removed.
 
     If the remaining structure exceeds what the causes explain, they are only approximate.

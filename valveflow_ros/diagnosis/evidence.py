@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.cause import Active, Estimate, Kind, Stage, Unknown
+from valveflow_ros.diagnosis.cause import Estimate, FittedCause, Kind, Stage, Unknown
 from valveflow_ros.diagnosis.causes import causes_for
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import (
@@ -285,7 +285,7 @@ def _while_unsure(task: Task, model: Extended) -> BoolArray:
             if not unknown.dated:
                 continue
 
-            def cost(value: float, a: Active = a, k: int = k) -> float:
+            def cost(value: float, a: FittedCause = a, k: int = k) -> float:
                 values = (*a.values[:k], value, *a.values[k + 1 :])
                 return task.cost(model.having(replace(a, values=values)))
 

@@ -20,7 +20,7 @@ from valveflow_ros.curve.characteristic import (
 )
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
-from valveflow_ros.diagnosis.cause import Active, Stage
+from valveflow_ros.diagnosis.cause import FittedCause, Stage
 from valveflow_ros.diagnosis.grids import Grids, Reference
 from valveflow_ros.records import ByteArray, FloatArray
 from valveflow_ros.signals.static_form import StaticForm
@@ -44,9 +44,9 @@ class Extended:
     """A model with the causes found so far; without causes it is the plain simulation."""
 
     base: RegionalModel
-    active: tuple[Active, ...] = ()
+    active: tuple[FittedCause, ...] = ()
 
-    def at(self, stage: Stage) -> tuple[Active, ...]:
+    def at(self, stage: Stage) -> tuple[FittedCause, ...]:
         """Return the causes that act at one stage."""
         return tuple(a for a in self.active if a.cause.stage == stage)
 
@@ -67,7 +67,7 @@ class Extended:
         """Return the model without its causes."""
         return replace(self, active=())
 
-    def with_cause(self, added: Active) -> Extended:
+    def with_cause(self, added: FittedCause) -> Extended:
         """Return the model with one more cause."""
         return replace(self, active=(*self.active, added))
 
@@ -75,7 +75,7 @@ class Extended:
         """Return the model without a cause."""
         return replace(self, active=tuple(a for a in self.active if a.name != name))
 
-    def having(self, changed: Active) -> Extended:
+    def having(self, changed: FittedCause) -> Extended:
         """Return the model with other values for one of its causes."""
         return replace(
             self, active=tuple(changed if a.name == changed.name else a for a in self.active)
@@ -120,7 +120,7 @@ def drive(grids: Grids, model: Extended) -> Drive:
     return Drive(u, scale, added, gain)
 
 
-def acts_on_scale(a: Active, form: StaticForm) -> bool:
+def acts_on_scale(a: FittedCause, form: StaticForm) -> bool:
     """Return True if a cause changes p^e, not u: a cause of the pressure in a form with e."""
     return form.scaled and a.cause.family == 'nozzle'
 

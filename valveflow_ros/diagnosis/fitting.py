@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import Active, Cause, Kind, Stage, Values
+from valveflow_ros.diagnosis.cause import Cause, FittedCause, Kind, Stage, Values
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.grids import ORDER, Grids
 from valveflow_ros.fit.descent import descend, gauss_newton
@@ -71,13 +71,13 @@ def beliefs(
             belief[k] = (1.0 - shared) * belief[k] / total + shared / count
 
 
-def drawn(model: Extended) -> Active | None:
+def drawn(model: Extended) -> FittedCause | None:
     """Return the cause of a model that uses noise realisations; None if there is none."""
     return next((a for a in model.active if a.cause.draws), None)
 
 
 def _believed(
-    grids: Grids, model: Extended, a: Active, ar: FloatArray
+    grids: Grids, model: Extended, a: FittedCause, ar: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals and weights of all realisations, both (k, m)."""
     rest = np.empty((a.cause.draws, len(grids.power)))
@@ -92,12 +92,12 @@ def _believed(
     return rest, out
 
 
-def believed_residual(grids: Grids, model: Extended, a: Active, ar: FloatArray) -> FloatArray:
+def believed_residual(grids: Grids, model: Extended, a: FittedCause, ar: FloatArray) -> FloatArray:
     """Return the residual of the weighted mean of all realisations in MW, shape (m,).
 
     Parameters
     ----------
-    a : Active
+    a : FittedCause
         The cause of the model that uses noise realisations.
     ar : float64 (p,)
         AR coefficients of the noise.
@@ -149,12 +149,12 @@ def free(model: Extended, causes: Mapping[str, Cause]) -> Extended:
     )  # fmt: skip
 
 
-def _first_of_opening(model: Extended) -> Active:
+def _first_of_opening(model: Extended) -> FittedCause:
     """Return the cause that acts on the measured opening itself."""
     return min(model.at(Stage.OPENING), key=lambda a: a.cause.order)
 
 
-def _single(a: Active, draw: int) -> Active:
+def _single(a: FittedCause, draw: int) -> FittedCause:
     """Return the cause with one of its noise realisations; ``extra`` holds the number of it."""
     assert a.cause.draw is not None
     return replace(

@@ -104,7 +104,7 @@ def on_top(record: Record, earlier: ExtendedModel, measured: SampleTable) -> Rec
     return replace(record, table=rows, measured=measured)
 
 
-def freed(record: Record, held: tuple[HeldCause, ...]) -> Record:
+def without_causes(record: Record, held: tuple[HeldCause, ...]) -> Record:
     """Return a record with removed causes whose measured rows are not available.
 
     A corrected opening may be constant for hours at a stop or inside a backlash; this is not a
@@ -150,7 +150,7 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
     if not task.curve.dynamics:
         model = first_model(table, step_s, form, settings.settle_s)
     record = Record(table, step_s, form, settings.settle_s, _spans_ns(contents))
-    record = freed(record, task.curve.held)
+    record = without_causes(record, task.curve.held)
     text = json.dumps(to_json(diagnose(record, model)), allow_nan=False)
     return DiagnosisContent(task.window_end_ns, text)
 

@@ -28,7 +28,7 @@ from valveflow_ros.curve.json_schema import (
     fail,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import Active, Estimate
+from valveflow_ros.diagnosis.cause import Estimate, FittedCause
 from valveflow_ros.diagnosis.causes import TO_DO, catalogue
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.evidence import Gain, SegmentGain
@@ -330,14 +330,14 @@ def _base(top: dict[str, Any], inside: str) -> RegionalModel:
     return RegionalModel(knots, left, right, levels, times, delays, offset)
 
 
-def _causes(found: list[dict[str, Any]], path: str, form: StaticForm) -> tuple[Active, ...]:
+def _causes(found: list[dict[str, Any]], path: str, form: StaticForm) -> tuple[FittedCause, ...]:
     names = [cause['name'] for cause in found]
     if len(set(names)) < len(names):
         raise fail(_WHOLE, path, 'names a cause twice')
     return tuple(_cause(cause, f'{path}[{k}]', form) for k, cause in enumerate(found))
 
 
-def _cause(found: dict[str, Any], path: str, form: StaticForm) -> Active:
+def _cause(found: dict[str, Any], path: str, form: StaticForm) -> FittedCause:
     cause = catalogue().get(found['name'])
     if cause is None and (about := found['covariate']):
         given: dict[str, Any] = {
@@ -351,7 +351,7 @@ def _cause(found: dict[str, Any], path: str, form: StaticForm) -> Active:
     cause = cause.on(form)
     schema = {u.name: Number(u.low, u.high) for u in cause.unknowns}
     values = checked(found['values'], schema, _WHOLE, f'{path}.values')
-    return Active(cause, tuple(values.values()), tuple(found['switches_s']))
+    return FittedCause(cause, tuple(values.values()), tuple(found['switches_s']))
 
 
 # The diagnosis as JSON: ``diagnosis.json``.

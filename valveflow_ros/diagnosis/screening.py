@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from valveflow_ros.diagnosis.cause import Active, Cause, Start, Values
+from valveflow_ros.diagnosis.cause import Cause, FittedCause, Start, Values
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.fitting import (
     Task,
@@ -181,7 +181,7 @@ class Screening:
 
     def displaced(self, cause: Cause, values: Values, extra: Values = ()) -> Start:
         """Simulate the model with a cause of given size and return its gain."""
-        model = self.model.with_cause(Active(cause, cause.clipped(values), extra))
+        model = self.model.with_cause(FittedCause(cause, cause.clipped(values), extra))
         change = self.task.innovations(self._explained(model))
         left = self.rest - change
         toward = self.n.T @ left
@@ -207,7 +207,7 @@ class Screening:
         (size,) = unit
         tried = []
         for sign in (1.0, -1.0):
-            model = self.model.with_cause(Active(cause, (sign * size,)))
+            model = self.model.with_cause(FittedCause(cause, (sign * size,)))
             change = self.task.innovations(answer(self.grids, model) - self.here)
             rest = change - self.n @ (self._inverse @ (self.n.T @ change))
             slope = float(rest @ self.rest) / max(float(rest @ rest), 1e-300)
@@ -246,7 +246,7 @@ class Screening:
 
     def scaled_height(self, cause: Cause, shape: Values) -> Start:
         """Return the start of a cause that is linear in its first parameter."""
-        model = self.model.with_cause(Active(cause, (1.0, *shape)))
+        model = self.model.with_cause(FittedCause(cause, (1.0, *shape)))
         change = self.task.innovations(answer(self.grids, model) - self.here)
         change = change - self.n @ (self._inverse @ (self.n.T @ change))
         own, toward = float(change @ change), float(change @ self.rest)

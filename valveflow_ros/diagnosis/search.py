@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import Active, Start
+from valveflow_ros.diagnosis.cause import FittedCause, Start
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive
@@ -178,7 +178,7 @@ _SIGN_TOLD = 10.0  # log-likelihood by which one sign must be better than the ot
 _LEAST_BEND = 0.1  # of the height of the named one: smaller bends are ignored
 
 
-def other_bend(found: Found) -> Extended | None:
+def other_bend(found: SearchResult) -> Extended | None:
     """Give `curve_shape` the better sign; return the other model if it fits nearly as well.
 
     Both are fitted in the same way and compared with the whitening of the better one; each
@@ -227,7 +227,7 @@ def _settled_anew(task: Task, model: Extended) -> tuple[Task, Extended]:
     return settle(task, model, rounds=1, steps=6)[:2]
 
 
-def _bend(model: Extended) -> Active | None:
+def _bend(model: Extended) -> FittedCause | None:
     return next((a for a in model.active if a.name == 'curve_shape'), None)
 
 
@@ -260,12 +260,12 @@ class Rival:
     """A candidate cause after a full refit; ``score`` is half a penalised sum of squares."""
 
     model: Extended
-    added: Active
+    added: FittedCause
     score: float
 
 
 @dataclass(slots=True)
-class Found:
+class SearchResult:
     """The outcome of the search.
 
     Attributes
@@ -302,12 +302,14 @@ class Found:
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'
 
 
-def search(task: Task, start: Extended, progress: Progress, rough: Grids | None = None) -> Found:
+def search(
+    task: Task, start: Extended, progress: Progress, rough: Grids | None = None
+) -> SearchResult:
     """Fit the plain model, then add causes while one of them passes all tests."""
     progress(0.05, 'simulation fitted to the record')
     task, plain, _ = settle(task, start, rounds=2, steps=4)
     task, plain = without_bumps(task, plain)
-    found = Found(task, plain, plain, rough=rough)
+    found = SearchResult(task, plain, plain, rough=rough)
     barred: set[str] = set()
     every = causes_for(task.grids)
     for name, cause in every.items():
@@ -338,7 +340,7 @@ def search(task: Task, start: Extended, progress: Progress, rough: Grids | None 
     return found
 
 
-def _conceal(found: Found, barred: set[str]) -> None:
+def _conceal(found: SearchResult, barred: set[str]) -> None:
     """Reject causes that cannot be judged together with the causes found."""
     for a in found.model.active:
         for name, cause in catalogue().items():
@@ -347,7 +349,7 @@ def _conceal(found: Found, barred: set[str]) -> None:
                 barred.add(name)
 
 
-def _add(found: Found, barred: set[str]) -> bool:
+def _add(found: SearchResult, barred: set[str]) -> bool:
     """Add the best cause if it passes the tests; return True if it did."""
     rivals = _visible(found, _rivals(found, barred), barred)
     if not rivals:
@@ -385,7 +387,7 @@ def _add(found: Found, barred: set[str]) -> bool:
     return False
 
 
-def _visible(found: Found, rivals: list[Rival], barred: set[str]) -> list[Rival]:
+def _visible(found: SearchResult, rivals: list[Rival], barred: set[str]) -> list[Rival]:
     """Return candidates that the recording cannot imitate; reject the others."""
     seen = []
     for rival in rivals:
@@ -402,7 +404,7 @@ _TIMES = {'clock': 'd_s', 'reheater': 'time_s', 'region_lag': 'time_s', 'rate_li
 _SLACKS = {'backlash': 'w_percent', 'stiction': 's_percent'}
 
 
-def hidden(added: Active, grids: Grids) -> str:
+def hidden(added: FittedCause, grids: Grids) -> str:
     """Return why the recording may hide or imitate a cause of this size; '' if it cannot.
 
     For a rate limit, the duration of a typical fast move counts.
@@ -427,7 +429,7 @@ def unseen(name: str, grids: Grids) -> str:
     return f'{blur.words} lags and delays below {blur.time_s:.0f} s'
 
 
-def _take(found: Found, rival: Rival, gain: float) -> None:
+def _take(found: SearchResult, rival: Rival, gain: float) -> None:
     """Fit the model with its new cause; identify curve and regions again after a strong one."""
     found.task, settled, _ = settle(found.task, rival.model, rounds=1, steps=3)
     found.model = held(found.task.grids, settled, found.task.ar)
@@ -435,7 +437,7 @@ def _take(found: Found, rival: Rival, gain: float) -> None:
         found.task, found.model = rebuilt(found.task, found.model)
 
 
-def _absorb(found: Found, rival: Rival) -> None:
+def _absorb(found: SearchResult, rival: Rival) -> None:
     """Make an effect that an identification may also find part of the plain model: no fault."""
     name = rival.added.name
     found.evidence.pop(name, None)
@@ -464,7 +466,7 @@ def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]
     return [(n, s) for n in good for s in starts[n]]
 
 
-def _rivals(found: Found, barred: set[str]) -> list[Rival]:
+def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
     """Refit every promising cause; return one candidate per cause, best score first."""
     screening = Screening(found.task, found.model, found.rough)
     shortlist = _shortlist(screening, barred)
@@ -472,7 +474,7 @@ def _rivals(found: Found, barred: set[str]) -> list[Rival]:
     tangents = base_tangents(found.task, found.model) if shortlist else None
     refits = []
     for name, start in shortlist:
-        added = Active(every[name], start.values, start.extra)
+        added = FittedCause(every[name], start.values, start.extra)
         model, frozen = found.model, tangents
         if start.base is not None:
             model, frozen = replace(model, base=start.base), None
@@ -520,7 +522,7 @@ def _refit(task: Task, model: Extended, tangents: FloatArray | None) -> tuple[Ex
     return improve(task, model, 3, tangents)
 
 
-def _drop_weak(found: Found, barred: set[str]) -> None:
+def _drop_weak(found: SearchResult, barred: set[str]) -> None:
     """Remove each earlier cause that the later ones have made superfluous."""
     for a in found.model.active[:-1]:
         if len(found.model.active) < 2:

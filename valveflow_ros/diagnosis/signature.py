@@ -171,7 +171,7 @@ class ResidualMap:
         Mean residual in MW of the plain and of the extended model; NaN in cells with too few
         minutes or with a mean that chance exceeds in one of a hundred records.
     shown_before, shown_after : int
-        Number of cells beyond chance.
+        Number of cells outside the 99 % band of random noise.
     cells : int
         Number of cells with enough minutes; one in a hundred of them exceeds the limit by chance.
     """

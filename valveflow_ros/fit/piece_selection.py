@@ -35,13 +35,13 @@ _SURE = 1e3  # upper limit of the gain, to avoid overflow
 # Factor of the log-likelihood in the probabilities: a breakpoint may exist although the data
 # hardly show it. Chosen on 66 random units of one to four days, of which 81 % were right;
 # `benchmarks.joint_selection_study` tests it on others.
-_TEMPER = 0.2
+_ODDS_EXPONENT = 0.2
 _CANDIDATES = 30
 _BLOCKS = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Grown:
+class ChosenPieces:
     """A model with its number of pieces chosen.
 
     Attributes
@@ -135,7 +135,9 @@ def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: Floa
     )
 
 
-def choose_pieces(problem: Problem, model: RegionalModel, ar: FloatArray, most: int) -> Grown:
+def choose_pieces(
+    problem: Problem, model: RegionalModel, ar: FloatArray, most: int
+) -> ChosenPieces:
     """Add and remove breakpoints until each of them gains enough log-likelihood.
 
     Parameters
@@ -156,7 +158,7 @@ def choose_pieces(problem: Problem, model: RegionalModel, ar: FloatArray, most: 
         if gain < KNEE_GAIN:
             break
         model = larger
-    return Grown(model, worth)
+    return ChosenPieces(model, worth)
 
 
 def _grown(
@@ -221,7 +223,7 @@ def confidence(worth: dict[int, float], most: int) -> dict[int, float]:
     Parameters
     ----------
     worth : dict
-        As in `Grown`.
+        As in `ChosenPieces`.
     most : int
         Largest number of pieces in the result.
 
@@ -233,14 +235,14 @@ def confidence(worth: dict[int, float], most: int) -> dict[int, float]:
     Notes
     -----
     If a piece gains `KNEE_GAIN`, J and J - 1 are equally probable; each further unit of
-    log-likelihood multiplies the odds by ``exp(_TEMPER)``. Pieces that were not tried
+    log-likelihood multiplies the odds by ``exp(_ODDS_EXPONENT)``. Pieces that were not tried
     are assumed to gain as much as the last one that was tried.
     """
     last = max(worth, default=1)
     odds = [0.0]
     for j in range(2, most + 1):
         value = worth.get(j, worth.get(last, 0.0) if j > last else math.inf)
-        odds.append(odds[-1] + _TEMPER * (min(value, _SURE) - KNEE_GAIN))
+        odds.append(odds[-1] + _ODDS_EXPONENT * (min(value, _SURE) - KNEE_GAIN))
     weight = np.exp(np.array(odds) - max(odds))
     return {j: float(w) for j, w in enumerate(weight / weight.sum(), start=1)}
 

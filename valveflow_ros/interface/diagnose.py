@@ -38,6 +38,11 @@ from valveflow_ros.report.words import held_words
 from valveflow_ros.signals.align import Aligner, align_whole, aligned_blocks, gathered
 from valveflow_ros.signals.static_form import StaticForm
 
+_TRY_A_COLUMN = (
+    'A further signal of the table may explain the slow variation, such as the condenser '
+    'pressure: try --covariate NAME=COLUMN[:UNIT] on the table itself.'
+)
+
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisResult(Result):
@@ -214,6 +219,8 @@ def diagnose(
         found = search.diagnose_form(record, regional, other, there, part)
         record = other
     kept = () if log.compression is None else (log.compression.sentence,)
+    if found.disturbance is not None and not beside:
+        notes.append(_TRY_A_COLUMN)
     signatures, answers, maps = views(record, found)
     found = replace(found, notes=(*log.contents.warnings, *kept, *notes, *found.notes))
     found = found.measured_in(settings.output_unit)

@@ -106,14 +106,17 @@ class MonitorResult(Result):
     @property
     def reference_words(self) -> str:
         """Return a sentence on which curve is the reference, or why there is none."""
-        curve = next(
-            (e.characteristic for e in reversed(self.events) if isinstance(e, ReferenceSet)), None
-        )
-        if curve is not None:
+        references = [e.characteristic for e in self.events if isinstance(e, ReferenceSet)]
+        if references:
+            first_id, curve = references[0].model_id, references[-1]
             first, last = curve.source.window_start_ns, curve.source.window_end_ns
+            followed = (
+                '' if curve.model_id == first_id
+                else f' It followed the first reference, curve {first_id}, within the wear budget.'
+            )  # fmt: skip
             return (
-                f'The reference that later curves are judged against is curve {curve.model_id}, '
-                f'from data of {moment(first)} to {moment(last)}.'
+                f'The reference that later curves are compared with is curve {curve.model_id}, '
+                f'from data of {moment(first)} to {moment(last)}.{followed}'
             )
         days = self.settings.real('reference_after')
         return (
@@ -189,7 +192,7 @@ class MonitorResult(Result):
         ]
         if not standing:
             gone = f' {counted(len(alarms), "alarm")} came and went.' if alarms else ''
-            known = 'No alarm stands at the end.' if curves else 'No curve was found.'
+            known = 'No alarm stands at the end.' if curves else 'No new curve was found.'
             parts.append(paragraph(known + gone, '' if gone or not curves else 'good'))
         if not self.diagnoses:
             return parts

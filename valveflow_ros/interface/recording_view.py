@@ -20,7 +20,14 @@ from valveflow_ros.logs.mcap.follow import Batch, Follower, Picker, Raw
 from valveflow_ros.logs.mcap.gather import Rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
-from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS, KEPT, PREDICTION, Board
+from valveflow_ros.report.terminal.board import (
+    ALARM,
+    CURVE,
+    DIAGNOSIS,
+    KEPT,
+    PREDICTION,
+    MonitorState,
+)
 from valveflow_ros.report.terminal.frame import OK, STALE, WARN, Frame, HealthView
 from valveflow_ros.report.words import counted, duration, plain
 from valveflow_ros.signals.units import convert, known_units
@@ -131,7 +138,7 @@ class LogWatch:
     ----------
     path : Path
         An ``.mcap`` file, an ``.mcap.part``, a recording's folder, or a folder of those.
-    board : Board, optional
+    board : MonitorState, optional
         Object that keeps the state; a new one by default.
     kept : int
         Number of newest predictions that are passed to the board, at the start and later.
@@ -147,12 +154,12 @@ class LogWatch:
         Fraction of the present file that has been read, 0 to 1.
     """
 
-    def __init__(self, path: Path, board: Board | None = None, kept: int = KEPT) -> None:
+    def __init__(self, path: Path, board: MonitorState | None = None, kept: int = KEPT) -> None:
         place = recording_in(path)
         self._follower = Follower(place)
         self._name = place.name or str(place)
         self._picker = Picker()
-        self._board = Board() if board is None else board
+        self._board = MonitorState() if board is None else board
         self._wanted = {**_WANTED, PREDICTION: kept}
         self._inputs = InputWatch()
         self._parameters = b''

@@ -36,7 +36,10 @@ _LIMIT = 1.0
 # Indices of the alarm state: condition, start of the running delay, delay running, time of the
 # last row; time without judgement, time with judgement, suppressed; events at the last row, time
 # step before it; last time without evidence.
-_ACTIVE, _SINCE, _COUNTING, _LAST_NS, _BLIND, _SIGHT, _DARK, _WHAT, _STEP, _CALM_NS = range(10)
+(
+    _ACTIVE, _SINCE, _COUNTING, _LAST_NS, _UNJUDGED_NS, _JUDGED_NS, _SUPPRESSED, _WHAT, _STEP,
+    _CALM_NS,
+) = range(10)  # fmt: skip
 _PLACES = 10
 # The onset is the last time when the evidence was below this fraction of the limit.
 _CALM = 0.25
@@ -91,17 +94,17 @@ def _sight(
     the alarm.
     """
     if not judged:
-        memory[_SIGHT] = max(0, memory[_SIGHT] - watched_ns)
-        memory[_BLIND] += watched_ns
-        if memory[_DARK] == 0 and memory[_BLIND] >= dark_ns:
-            memory[_DARK], memory[_SIGHT] = 1, 0
+        memory[_JUDGED_NS] = max(0, memory[_JUDGED_NS] - watched_ns)
+        memory[_UNJUDGED_NS] += watched_ns
+        if memory[_SUPPRESSED] == 0 and memory[_UNJUDGED_NS] >= dark_ns:
+            memory[_SUPPRESSED], memory[_JUDGED_NS] = 1, 0
             return _DARKENED
         return 0
-    memory[_SIGHT] = min(memory[_SIGHT] + watched_ns, back_ns)
-    seen = memory[_SIGHT] >= back_ns
-    memory[_BLIND] = 0 if seen else max(0, memory[_BLIND] - watched_ns)
-    if memory[_DARK] != 0 and (seen or turned):
-        memory[_DARK] = memory[_BLIND] = 0
+    memory[_JUDGED_NS] = min(memory[_JUDGED_NS] + watched_ns, back_ns)
+    seen = memory[_JUDGED_NS] >= back_ns
+    memory[_UNJUDGED_NS] = 0 if seen else max(0, memory[_UNJUDGED_NS] - watched_ns)
+    if memory[_SUPPRESSED] != 0 and (seen or turned):
+        memory[_SUPPRESSED] = memory[_UNJUDGED_NS] = 0
         return _SEEING
     return 0
 

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The state of one unit for the page: its `Board`, the last 24 hours, alarm changes."""
+"""The state of one unit for the page: its `MonitorState`, the last 24 hours, alarm changes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.terminal.board import ALARM, PREDICTION, Board, ItemView
+from valveflow_ros.report.terminal.board import ALARM, PREDICTION, ItemView, MonitorState
 from valveflow_ros.report.terminal.frame import NORMAL, AlarmView, Frame, SampleView
 
 MINUTE_NS = 60 * NS_PER_S
@@ -155,7 +155,7 @@ class Snapshot:
         return self.frame.unit or self.key
 
 
-class Unit(Board):
+class Unit(MonitorState):
     """The state of one monitor for the page, with bounded memory.
 
     Parameters

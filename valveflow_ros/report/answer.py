@@ -11,7 +11,6 @@ import numpy as np
 from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
-    Piece,
     RegionDynamics,
 )
 from valveflow_ros.fit.model_form import Misfit
@@ -108,21 +107,63 @@ def form_words(c: Characteristic) -> str:
     )
 
 
-def opening_gain(data: Identified, piece: Piece) -> tuple[float, float]:
-    """Return MW per % of opening on a piece as shown, and the pressure in MPa for that value.
+_LOADS = 50.0, 20.0, 10.0, 5.0  # steps of the table by load, MW
+_NEAR = 0.02  # of the range of the power: rows at a load
+_LEAST_ROWS = 20
 
-    The pressure is the median over the special samples on the piece.
+
+def gain_by_load(data: Identified) -> list[tuple[float, float, float, float, float]]:
+    """Return load in MW, usual pressure in MPa, opening in %, MW per % of opening, 95 % error.
+
+    Pressure and opening are medians of the special samples near the load.
     """
-    rows = data.special
-    u = data.u[rows]
-    inside = rows[(u >= piece.u_from) & (u <= piece.u_to)]
-    pressure = data.table.column(Signal.MAIN_STEAM_PRESSURE)[inside]
-    if not len(pressure):
-        return math.nan, math.nan
-    if data.at_pressure:
-        return piece.slope, data.characteristic.reference_pressure_mpa
-    p = float(np.median(pressure))
-    return piece.slope * p**data.characteristic.pressure_exponent, p
+    c = data.characteristic
+    power, opening, pressure = (
+        data.table.column(signal)[data.special]
+        for signal in (
+            Signal.GENERATED_POWER, Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE
+        )
+    )  # fmt: skip
+    if not len(power):
+        return []
+    low, high = np.quantile(power, (0.01, 0.99)).tolist()
+    step = next((s for s in _LOADS if high - low > 4.0 * s), (high - low) / 4.0)
+    rows = []
+    for load in np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step:
+        near = np.abs(power - load) < _NEAR * (high - low)
+        if near.sum() < _LEAST_ROWS or not np.isfinite(pressure[near]).any():
+            continue
+        p, v = float(np.nanmedian(pressure[near])), float(np.nanmedian(opening[near]))
+        u = v * p**c.pressure_exponent
+        at = int(np.clip(np.searchsorted(c.breakpoints, u) - 1, 0, len(c.pieces) - 1))
+        per_percent = p ** (c.pressure_exponent + c.pressure_scale_exponent)
+        piece = c.pieces[at]
+        error = 1.96 * piece.slope_stderr * per_percent
+        rows.append((float(load), p, v, piece.slope * per_percent, error))
+    return rows
+
+
+def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
+    """Return head and cells of the table of MW per % of opening by load."""
+    unit = data.characteristic.output_unit
+    head = [f'load ({unit})', 'usual pressure (MPa)', 'opening (%)',
+            f'{unit} per 1 % of opening', '95 % interval']  # fmt: skip
+    cells = [
+        [
+            decimals(load, 0 if load % 1.0 == 0.0 else 1), decimals(p, 1), decimals(v, 0),
+            plain(gain, 3),
+            f'{plain(gain - error, 3)} to {plain(gain + error, 3)}' if error > 0.0 else '-',
+        ]
+        for load, p, v, gain, error in gain_by_load(data)
+    ]  # fmt: skip
+    return head, cells
+
+
+def gain_table(data: Identified) -> str:
+    """Return the table of MW per % of opening by load; empty without data for it."""
+    head, cells = gain_cells(data)
+    caption = 'MW per 1 % of opening at each load, at the pressure that is usual at this load.'
+    return table(head, cells, caption=caption) if cells else ''
 
 
 def answer_words(data: Identified) -> str:
@@ -185,19 +226,17 @@ def pieces_table(data: Identified) -> str:
     m, u = c.pressure_exponent, input_name(c.pressure_exponent)
     rows = []
     for k, piece in enumerate(c.pieces):
-        gain, pressure = opening_gain(data, piece)
-        at = f' at {plain(pressure, 3)} MPa' if math.isfinite(pressure) else ''
         low, high = (piece.slope * u + piece.intercept for u in (piece.u_from, piece.u_to))
         rows.append([
             str(k + 1), span(piece.u_from, piece.u_to, 1), span(low, high, 1),
             with_error(piece.slope, piece.slope_stderr),
-            with_error(piece.intercept, piece.intercept_stderr), plain(gain, 3) + at,
-            count(piece.samples), *_rests(c, k),
+            with_error(piece.intercept, piece.intercept_stderr), count(piece.samples),
+            *_rests(c, k),
         ])  # fmt: skip
     head = [
         'piece', f'{u} ({input_unit(m)})', f'power{data.at_pressure} (MW)',
         f'slope ± standard error ({per_input(m)})', 'intercept ± standard error (MW)',
-        'MW per 1 % of opening', 'samples', *(['rests on'] if c.support else []),
+        'samples', *(['rests on'] if c.support else []),
     ]  # fmt: skip
     return table(head, rows)
 

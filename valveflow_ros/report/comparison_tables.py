@@ -162,7 +162,7 @@ def totals_table(data: Compared) -> str:
         'mean difference (MW)', 'zero stands, each sample counted',
         'zero stands, correlation counted',
     ]  # fmt: skip
-    return table(head, rows, caption='Mean squared errors on the data to judge by.')
+    return table(head, rows, caption='Mean squared errors on the test data.')
 
 
 def pairs_table(pairs: Sequence[Pair]) -> str:

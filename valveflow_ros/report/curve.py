@@ -41,6 +41,7 @@ from valveflow_ros.report.words import (
     span,
     with_error,
 )
+from valveflow_ros.signals.static_form import OPENING
 
 _Z95 = 1.959963984540054
 _SHADES = 5
@@ -67,12 +68,21 @@ def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
     return np.asarray(piece.slope_stderr * np.sqrt((u - inside.mean()) ** 2 + inside.var()))
 
 
+def _unrefined(data: Identified) -> bool:
+    """Return True if the partition before the refinement can be drawn beside the curve.
+
+    That of p^e F(V) + c has the e and c of its own, which the refinement changed.
+    """
+    c = data.characteristic
+    return c.axis != OPENING and c.pieces != c.partition_pieces
+
+
 def curve_figure(data: Identified) -> Figure:
     """Return the figure of the characteristic."""
     c = data.shown
     u = data.u[data.special]
     traces = [_heat(u, data.power_shown[data.special]), *_bands(data, u)]
-    if c.pieces != c.partition_pieces:
+    if _unrefined(data):
         traces.append(_line(c.partition_pieces, 'before refining', 'raw', 1.2, 'dash', ''))
     if data.reference is not None:
         there = data.reference.at_pressure(c.reference_pressure_mpa)
@@ -124,7 +134,7 @@ def opening_figure(data: Identified) -> Figure | None:
         if p == middle or wide
     ]  # fmt: skip
     caption = (
-        '<b>How many MW one percent of opening gives.</b> The same curve against the opening of '
+        '<b>Power against opening.</b> The same curve against the opening of '
         f'the valve, at the median pressure of the record, {middle:.3g} MPa'
         + (', and at its 5 % and 95 % quantiles.' if wide else '.')
     )
@@ -143,7 +153,7 @@ def _caption(data: Identified) -> str:
         parts.append(
             'The breakpoints of this valve are at fixed openings; the power is '
             f'shown{data.at_pressure}, at '
-            'other pressures the power goes with their ratio to the power '
+            'other pressures p the part without the constant c is proportional to p^'
             f'{data.characteristic.pressure_scale_exponent:.3g}.'
         )
     if len(c.pieces) > 1:
@@ -161,10 +171,10 @@ def _caption(data: Identified) -> str:
             f'The tinted background is where the unit ran in the last day, u {day[0]:.0f} to '
             f'{day[1]:.0f}.'
         )
-    if c.pieces != c.partition_pieces:
+    if _unrefined(data):
         parts.append(
             'The dashed <span class="key raw">line</span> is the exact partition before the '
-            'dynamics were fitted too; where it differs from the curve, the lag on ramps had '
+            'dynamics were fitted too; it differs from the curve where the lag on ramps had '
             'shifted it.'
         )
     return ' '.join(parts)

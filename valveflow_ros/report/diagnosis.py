@@ -44,6 +44,7 @@ from valveflow_ros.report.words import (
     UNKNOWN,
     counted,
     duration,
+    floor_words,
     input_unit,
     input_unit_plain,
     interval,
@@ -122,7 +123,7 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     parts.append(paragraph(
         'On held-out data, the simulation differs from the measured '
         f'power by {level(d.rmse_simulation, 2)} MW, the extended model by '
-        f'{level(d.rmse_extended, 2)} MW; noise alone gives about '
+        f'{level(d.rmse_extended, 2)} MW; {floor_words(d.disturbance is not None)} about '
         f'{level(d.rmse_noise_floor, 2)} MW.'
     ))  # fmt: skip
     if ranked:
@@ -197,7 +198,7 @@ def _proof(data: Diagnosed) -> Section:
     rows = [
         ['simulation', level(d.rmse_simulation, 3)],
         ['extended model', level(d.rmse_extended, 3)],
-        ['noise alone (estimate)', level(d.rmse_noise_floor, 3)],
+        [f'{floor_words(d.disturbance is not None)} (estimate)', level(d.rmse_noise_floor, 3)],
     ]
     parts: list[str | Figure] = [
         paragraph(

@@ -15,6 +15,7 @@ from valveflow_ros.report.answer import (
     confidence_table,
     dynamics_figure,
     dynamics_table,
+    gain_table,
     pieces_table,
     temperature_words,
     window_words,
@@ -66,7 +67,7 @@ def identification_page(data: Identified) -> Page:
     sections = [
         Section('The answer', [
             *([notice(text(data.mixture))] if data.mixture else []),
-            answer_words(data), curve_figure(data),
+            answer_words(data), gain_table(data), curve_figure(data),
             *([against] if (against := opening_figure(data)) else []), pieces_table(data),
             breakpoints_table(data.shown),
         ]),

@@ -177,6 +177,11 @@ def in_zone(said: str, zone: tzinfo | None) -> str:
     return _UTC_MOMENT.sub(local, said)
 
 
+def floor_words(disturbed: bool) -> str:
+    """Return what the estimate of the noise floor contains."""
+    return 'noise and the slow variation' if disturbed else 'noise alone'
+
+
 def period(start_ns: int, end_ns: int) -> str:
     """Return two times as 'from to'."""
     return f'{moment(int(start_ns))} to {moment(int(end_ns))}'

@@ -20,7 +20,7 @@ from valveflow_ros.report.terminal.board import (
     HEALTH,
     KEPT,
     PREDICTION,
-    Board,
+    MonitorState,
 )
 
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -59,11 +59,11 @@ class Listener:
     node : Node
     monitor : str
         Full name of the monitor's node.
-    board : Board
+    board : MonitorState
         Call `tell` before reading it.
     """
 
-    def __init__(self, node: Node, monitor: str, board: Board) -> None:
+    def __init__(self, node: Node, monitor: str, board: MonitorState) -> None:
         self._node = node
         self.monitor = monitor
         self.board = board

@@ -23,7 +23,7 @@ from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.records import NS_PER_S, zone_of
-from valveflow_ros.report.terminal.board import CURVE, HEALTH, PREDICTION, Board
+from valveflow_ros.report.terminal.board import CURVE, HEALTH, PREDICTION, MonitorState
 from valveflow_ros.report.terminal.frame import Frame
 from valveflow_ros.report.terminal.screen import Screen
 from valveflow_ros.report.terminal.text import number, zone_argument
@@ -75,7 +75,7 @@ class WatchNode(Node):
         self.several = tuple(found) if len(found) > 1 and not self._wanted else ()
         if self._wanted in found or (len(found) == 1 and not self._wanted):
             name = self._wanted or found[0]
-            self._heard[name] = Listener(self, name, Board())
+            self._heard[name] = Listener(self, name, MonitorState())
 
     def frame(self) -> Frame:
         """Return the current content of the view."""

@@ -53,7 +53,8 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         '--pressure', metavar='MPA', action='append', default=[],
         type=number('a pressure in MPa', 1e-6, 100, '--pressure 16.7'),
-        help='add a column with the opening at this main steam pressure; may be repeated',
+        help='add a column with the opening at this main steam pressure; may be repeated, '
+        'except for a curve with breakpoints at fixed openings',
     )  # fmt: skip
     parser.add_argument(
         '--max-gain', metavar='G',

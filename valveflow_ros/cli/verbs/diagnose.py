@@ -95,7 +95,7 @@ def _covariates(said: list[str]) -> dict[str, str]:
 
 def _text(found: DiagnosisResult) -> str:
     from valveflow_ros.report.diagnosis import cells
-    from valveflow_ros.report.words import VERDICT_WORDS, advice, level
+    from valveflow_ros.report.words import VERDICT_WORDS, advice, floor_words, level
 
     d = found.diagnosis
     rows = [
@@ -117,7 +117,7 @@ def _text(found: DiagnosisResult) -> str:
         *(f'What would tell them apart: {e}' for e in d.experiments),
         'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
         f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW, '
-        f'noise alone about {level(d.rmse_noise_floor, 3)} MW.',
+        f'{floor_words(d.disturbance is not None)} about {level(d.rmse_noise_floor, 3)} MW.',
         '\n'.join(['Not judged:', *judged]) if judged else '',
         *d.notes,
     )

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,6 +136,7 @@ def _text(found: Identified) -> str:
         doubt(found),
         pieces_doubt(c),
         form_words(c),
+        _by_load(found),
         _pieces(found),
         _breakpoints(found.shown),
         _dynamics(c),
@@ -153,14 +153,19 @@ def _text(found: Identified) -> str:
     )
 
 
+def _by_load(found: Identified) -> str:
+    from valveflow_ros.report.answer import gain_cells
+
+    head, cells = gain_cells(found)
+    return columns(cells, head) if cells else ''
+
+
 def _pieces(found: Identified) -> str:
-    from valveflow_ros.report.answer import opening_gain
     from valveflow_ros.report.words import (
         count,
         input_name,
         input_unit_plain,
         per_input,
-        plain,
         span,
         with_error,
     )
@@ -168,22 +173,19 @@ def _pieces(found: Identified) -> str:
     c = found.shown
     rows = []
     for k, piece in enumerate(c.pieces):
-        gain, pressure = opening_gain(found, piece)
-        at = f'{plain(gain, 3)} at {plain(pressure, 3)} MPa' if math.isfinite(gain) else '-'
         rows.append(
             [
                 str(k + 1),
                 span(piece.u_from, piece.u_to, 1),
                 with_error(piece.slope, piece.slope_stderr),
                 with_error(piece.intercept, piece.intercept_stderr),
-                at,
                 count(piece.samples),
             ]
         )
     m = c.pressure_exponent
     head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})',
             f'slope{found.at_pressure} ({per_input(m)})', 'intercept (MW)',
-            'MW per 1 % opening', 'samples']  # fmt: skip
+            'samples']  # fmt: skip
     return columns(rows, head)
 
 

@@ -64,6 +64,10 @@ TO_DO = {
         'its last value. Only the diagnosis leaves these rows out. A running monitor uses them: '
         'repair the signal, then request a new curve (`~/refit`).'
     ),
+    'form': (
+        'Check that the model given is of this unit. If it is, find a new curve of this unit and '
+        'give that one.'
+    ),
     'gain_change': (
         'First ask whether the cooling water was as warm then. If it was, and the power fell: '
         'blading, heaters, an open bypass, or the scale of the power meter. If the change was '

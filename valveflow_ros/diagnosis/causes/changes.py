@@ -11,8 +11,8 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import (
-    Active,
     Cause,
+    FittedCause,
     Kind,
     SentenceValues,
     Stage,
@@ -334,7 +334,7 @@ def _switches(screening: Screening, path: ByteArray) -> Values:
     return tuple(screening.sub_start_s(int(k)) for k in edges)
 
 
-def infer(screening: Screening, active: Active, allowed: BoolArray) -> Values:
+def infer(screening: Screening, active: FittedCause, allowed: BoolArray) -> Values:
     """Return the switching times from the allowed sub-blocks, for a known size.
 
     The screening belongs to the model without this cause.

@@ -59,7 +59,7 @@ def covariate_cause(about: Covariate) -> Cause:
         b, per = values['b'], about.unit or 'unit'
         return (
             f'The power {"rises" if b > 0.0 else "falls"} by {abs(b):.2g} MW for every {per} that '
-            f'{name} ({about.column}) is higher, at a load of {about.power_mw:.0f} MW.'
+            f'{about.column} ({name}) is higher, at a load of {about.power_mw:.0f} MW.'
         )
 
     def hindered(grids: Grids) -> str:

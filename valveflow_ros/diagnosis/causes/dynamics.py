@@ -12,8 +12,8 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel, make_taps
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import (
-    Active,
     Cause,
+    FittedCause,
     Kind,
     SentenceValues,
     Stage,
@@ -136,7 +136,7 @@ def reheater_starts(screening: Screening) -> Sequence[Start]:
 def _fitted(screening: Screening, values: Values, base: RegionalModel) -> Start:
     """Return a reheater fitted with the whole model, from these initial values on that base."""
     task, model = screening.task, replace(screening.model, base=base)
-    model, cost = improve(task, model.with_cause(Active(REHEATER, values)), _STEPS)
+    model, cost = improve(task, model.with_cause(FittedCause(REHEATER, values)), _STEPS)
     gain = (task.cost(screening.model) - cost) / (2.0 * screening.variance)
     return Start(model.active[-1].values, gain, base=model.base)
 

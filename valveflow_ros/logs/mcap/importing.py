@@ -33,7 +33,7 @@ from valveflow_ros.logs.mcap.folder import (
     write_metadata,
 )
 from valveflow_ros.logs.mcap.records import RECORD_HEAD
-from valveflow_ros.logs.mcap.writer import Metadata, TopicBook
+from valveflow_ros.logs.mcap.writer import Metadata, TopicRegistry
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import new_file
 from valveflow_ros.logs.source import os_errors
@@ -139,7 +139,7 @@ def write_readings(
     target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'
     if target.exists() and not overwrite:
         raise RecordingError(target, 'exists already')
-    book = TopicBook(definitions or Definitions())
+    book = TopicRegistry(definitions or Definitions())
     channels = np.zeros(len(SIGNALS), dtype=np.uint16)
     for info in SIGNALS:
         if info.required or info.signal in signals:

@@ -73,7 +73,7 @@ LATCHED = Qos(durability='transient_local', depth=1)
 
 
 @dataclass(slots=True)
-class TopicBook:
+class TopicRegistry:
     """Assigns ids to topics and types in the order in which they are added."""
 
     definitions: Definitions
@@ -245,7 +245,7 @@ class RecordingWriter:
         self._at_hand = _File(Path())
         self._number = -1
         self._begun = 0
-        self._topics = TopicBook(definitions or Definitions())
+        self._topics = TopicRegistry(definitions or Definitions())
         self._builder = ChunkBuilder()
         self._file: ChunkFile | None = None
         self._sequences: dict[int, int] = {}
@@ -267,7 +267,7 @@ class RecordingWriter:
         type_hash: str | None = None,
         definition: str | None = None,
     ) -> None:
-        """Add a topic before its first message; see `TopicBook.add`."""
+        """Add a topic before its first message; see `TopicRegistry.add`."""
         self._topics.add(topic, type_name, qos, type_hash, definition)
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:

@@ -49,7 +49,7 @@ class ItemView:
     values: Mapping[str, str]
 
 
-class Board:
+class MonitorState:
     """The state of a monitor according to its messages, with bounded memory.
 
     Messages are mappings from field to value, independent of their transport.

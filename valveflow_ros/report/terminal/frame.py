@@ -13,7 +13,7 @@ from valveflow_ros.report.words import counted, decimals, duration, moment, sign
 # The numbers of the messages in plain words.
 CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused', 'provisional')
 SAMPLE_STATES = (
-    'no curve to judge by',
+    'no curve yet',
     'plant in motion',
     'steady state',
     'on a long ramp',
