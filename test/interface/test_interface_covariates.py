@@ -55,7 +55,7 @@ def test_the_vacuum_is_named_with_its_size(plant, diagnosed, without):
     assert b.high - b.low < 0.2 * abs(truth(plant))
     assert found.gain.rmse_after < 0.6 * found.gain.rmse_before
     assert d.rmse_extended < 0.6 * without.rmse_extended
-    assert f'for every kPa that vacuum ({COLUMN}) is higher' in found.sentence
+    assert f'for every kPa that {COLUMN} (vacuum) is higher' in found.sentence
 
 
 @needs_jit

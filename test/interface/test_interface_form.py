@@ -134,7 +134,7 @@ def test_a_curve_of_other_days_gets_the_form_of_its_reference():
 
 def test_loads_in_sentences_are_those_of_the_plant():
     short = vf.identify(vf.simulate(2.0, 1, unit=UNIT, recording='minute').log)
-    loads = re.findall(r'\(([0-9]+) MW\)', ' '.join(short.characteristic.notes))
+    loads = re.findall(r'at about ([0-9]+) MW', ' '.join(short.characteristic.notes))
     assert loads
     assert all(80.0 < float(load) < 360.0 for load in loads)
 

@@ -297,7 +297,7 @@ class Characteristic:
         """
         ends = np.array([u_from] if u_to is None else [u_from, u_to])
         if self.pressure_exponent == 0.0:
-            return ' to '.join(f'{v:.0f}' for v in ends.tolist()) + ' % opening'
+            return ' to '.join(f'{v:.1f}' for v in ends.tolist()) + ' % opening'
         knots = self.breakpoints
         power = self(np.clip(ends, knots[0], knots[-1]))
         return ' to '.join(f'{y:.0f}' for y in power.tolist()) + f' {self.output_unit}'

@@ -194,7 +194,7 @@ def validation_page(data: Validated) -> Page:
     )
     times = data.contents.time_ns
     lead = where(
-        f'{data.model}, held against {data.source}',
+        f'{data.model}, compared with {data.source}',
         period(times[0], times[-1]),
     )
     return Page('Does the flow characteristic hold?', lead, sections, end, 'validate')

@@ -74,7 +74,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     console(0.9, 'writing the report')
     data = found.data
     text = lines(
-        f'{data.model}, held against {data.source}:', *verdict_words(data), data.held,
+        f'{data.model}, compared with {data.source}:', *verdict_words(data), data.held,
         _pieces(data), _errors(data),
     )  # fmt: skip
     # The segments are only written to the file.
