@@ -38,6 +38,8 @@ _BETTER = 6.0  # by which the curve must be better than one change, and one chan
 _LEAST_SHARE = 0.0025
 _OF_DAYS = 2.0
 _LEAST_DAYS = 3
+# A bend of the curve between its pieces also looks a little like one of these changes.
+_LEAST_Z = 3.0
 _EXPLAINED = 0.5  # reduction of the mean square residual, as a fraction of that of the change
 _LOW, _HIGH = 0.05, 0.95  # quantiles of the load at which a change of the curve is reported
 _FULL_LOAD = 0.9
@@ -175,7 +177,16 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
     # Its difference from the curve must exceed the usual one between two curves of one unit.
     whole = by_hats - score[best] > _BETTER and _rms(by_curve - alone) > least
     there = max(by_hats, score[best]) - none.likelihood > _BETTER
-    if not there or not _explains(by_curve if whole or near else alone, found.power, least):
+    at = here[task.rows]
+    if whole or near:
+        change = _curve_change(given, curve, at, hats, () if whole else (best, *near), least)
+        sure = True
+    else:
+        change = _change(best, given, changed, value, fit, at, moved[task.rows], least)
+        sure = all(_is_sure(e) for e in change.parameters.values())
+    if not (
+        there and sure and _explains(by_curve if whole or near else alone, found.power, least)
+    ):
         size = _rms(by_curve)
         why = (
             f'Two records of one healthy unit may differ by {least:.2g} MW, also by the weather.'
@@ -186,10 +197,13 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
             f'Over the loads seen the record as a whole differs from the model given by '
             f'{size:.2g} MW (root mean square). {why}'
         )
-    at = here[task.rows]
-    if whole or near:
-        return _curve_change(given, curve, at, hats, () if whole else (best, *near), least)
-    return _change(best, given, changed, value, fit, at, moved[task.rows], least)
+    return change
+
+
+def _is_sure(estimate: Estimate) -> bool:
+    """Return True if an estimate is further from zero than its error allows by chance."""
+    error = (estimate.high - estimate.low) / (2.0 * _Z95)
+    return abs(estimate.value) > _LEAST_Z * error
 
 
 def _spread_of_days(left: FloatArray, hours: FloatArray) -> float:
@@ -271,7 +285,7 @@ def _change(
     sentence = f'{said} (95 % interval {ends[0]} to {ends[1]} {unit}); {_BEFORE}.'
     full = float(np.quantile(here, _FULL_LOAD))
     by = float(np.mean(moved[here >= full]))
-    meaning = f'At full load (from {full:.0f} MW on) it is {abs(by):.2g} MW ' + (
+    meaning = f'At full load (from {full:.0f} MW on) this makes {abs(by):.2g} MW ' + (
         'more.' if by > 0.0 else 'less.'
     )
     return Change(
