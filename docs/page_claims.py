@@ -170,7 +170,7 @@ def _diagnosis() -> list[tuple[str, str, str]]:
 
 def _since_model() -> tuple[str, str, str]:
     """Return how well a diagnosis tells what changed since the model that it is given."""
-    name = 'reference_22001_22005'
+    name = 'reference_26001_26005'
     kinds = list(result(name)['summary'].values())
     of = {what: [s[what] for s in kinds] for what in kinds[0]}
     one = [s for what in ('gain', 'offset', 'input') for s in of[what]]
