@@ -478,8 +478,10 @@ def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
     assert alarm.judge(reference.shift, 2, WORK) == []
     item = reference_item(monitor)
     assert item.level == Level.ERROR
-    assert item.sentence.startswith('The alarm stands: what moved, u ')
-    assert f'to {knot:.0f}, is not judged unmoved yet' in item.sentence
+    ends = curve.place_words(curve.pieces[-2].u_from, knot)
+    active = 'The alarm is still active: no later curve has confirmed the reference at '
+    assert item.sentence.startswith(active)
+    assert f'{ends}. ' in item.sentence
 
 
 NERVOUS = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_suppress_time': 60.0}
