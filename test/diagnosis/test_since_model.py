@@ -126,3 +126,10 @@ def test_a_diagnosis_compares_with_the_model_as_it_is_given(model):
     assert found.rmse_simulation > 1.3 * found.rmse_extended
     # Found in the record itself the model knows of no earlier time.
     assert diagnose(later(scaled_power(0.97)), model).verdict == 'nothing'
+
+
+def test_a_change_within_three_of_its_errors_is_not_named(model):
+    told = since(scaled_opening(1.004), model)
+    assert isinstance(told, str)
+    assert 'cannot be told' in told
+    assert since(scaled_opening(1.02), model).name == 'input_change'

@@ -47,6 +47,14 @@ def test_a_curve_becomes_the_reference_by_itself_and_is_announced(healthy):
     assert any(getattr(e, 'text', '') == BY_ITSELF for e in events)
 
 
+def test_a_reference_after_of_0_leaves_it_to_the_operator():
+    monitor = Monitor(SETTINGS.changed({'reference_after': 0.0}))
+    events = feed_rows(monitor, plant_table(1, N))
+    assert of_type(events, CurveAdopted)
+    assert not of_type(events, ReferenceSet)
+    assert monitor.reference.curve is None
+
+
 @pytest.mark.parametrize('added_mw', [-8.0, 6.0, 12.0])
 def test_a_fault_that_stays_stands_however_long_it_lasts(healthy, added_mw):
     """Longer than the window, over many fits and over a restart of the monitor."""

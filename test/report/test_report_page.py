@@ -20,8 +20,9 @@ from report_stories import diagnosed, history, words_of
 from valveflow_ros.curve.characteristic import Support
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Settings
+from valveflow_ros.records import Signal
 from valveflow_ros.report import page
-from valveflow_ros.report.answer import confidence_table
+from valveflow_ros.report.answer import confidence_table, gain_by_load
 from valveflow_ros.report.curve import band
 from valveflow_ros.report.data import gaps, rejected, usable_share
 from valveflow_ros.report.diagnosis import diagnosis_page
@@ -29,6 +30,7 @@ from valveflow_ros.report.figure import Figure, packed, rounded, time_axis, upri
 from valveflow_ros.report.identification import identification_page, identification_report
 from valveflow_ros.report.page import Page, Section, packed_plotly, read_text
 from valveflow_ros.report.words import in_zone
+from valveflow_ros.signals.static_form import OPENING
 
 MEGABYTE = 1_000_000
 
@@ -76,6 +78,30 @@ def test_gain_of_one_percent_of_opening_is_slope_times_pressure(report):
     words = words_of(report)
     assert 'MW per 1 % of opening' in words
     assert re.search(rf'12\.0 \d+ {0.2 * 12.0**1.125:.2f} ', words), words[:2000]
+
+
+@pytest.mark.parametrize(
+    'form',
+    [{}, {'axis': OPENING, 'pressure_exponent': 0.0, 'pressure_scale_exponent': 1.1}],
+)
+def test_gain_by_load_is_the_slope_of_the_power_over_the_opening(make, form):
+    data = make()
+    pieces = data.characteristic.pieces
+    if form:
+        v = data.table.column(Signal.VALVE_OPENING)
+        low, high = float(np.nanmin(v)) - 1.0, float(np.nanmax(v)) + 1.0
+        pieces = (replace(pieces[0], u_from=low, u_to=high, slope=0.2, slope_stderr=0.01),)
+        form = {**form, 'pieces': pieces, 'partition_pieces': pieces}
+    data = replace_characteristic(data, **form)
+    rows = gain_by_load(data)
+    assert rows
+    for _, p, v, gain, error in rows:
+        up, down = data.characteristic.power([v + 1e-4, v - 1e-4], [p, p])
+        assert gain == pytest.approx((up - down) / 2e-4, rel=1e-3)
+        assert error > 0.0
+    values = data.table.values.copy()
+    values[:, Signal.GENERATED_POWER] = 200.0
+    assert gain_by_load(replace(data, table=replace(data.table, values=values))) == []
 
 
 def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):

@@ -127,6 +127,8 @@ def gain_by_load(data: Identified) -> list[tuple[float, float, float, float, flo
     if not len(power):
         return []
     low, high = np.quantile(power, (0.01, 0.99)).tolist()
+    if not high > low:
+        return []
     step = next((s for s in _LOADS if high - low > 4.0 * s), (high - low) / 4.0)
     rows = []
     for load in np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step:

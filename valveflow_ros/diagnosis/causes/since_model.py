@@ -38,7 +38,8 @@ _BETTER = 6.0  # by which the curve must be better than one change, and one chan
 _LEAST_SHARE = 0.0025
 _OF_DAYS = 2.0
 _LEAST_DAYS = 3
-# A bend of the curve between its pieces also looks a little like one of these changes.
+# A bend of the curve between its pieces also looks a little like one of these changes. Fixed on
+# seeds 22001 to 22005 of benchmarks/reference_study.py and on the plant of docs/effects.
 _LEAST_Z = 3.0
 _EXPLAINED = 0.5  # reduction of the mean square residual, as a fraction of that of the change
 _LOW, _HIGH = 0.05, 0.95  # quantiles of the load at which a change of the curve is reported
