@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtr
+from scipy.special import chdtrc, ndtri, stdtr
 
 from valveflow_ros.curve.characteristic import Characteristic, piece_of
 from valveflow_ros.records import (
@@ -44,8 +44,6 @@ class Scan:
         Weighted means on both sides, in the unit of the series.
     after_error : float
         Standard error of ``after``.
-    likelihood : float64 (n + 1,)
-        Log-likelihood of a change after k members, relative to no change; -inf if not tested.
     """
 
     place: int
@@ -53,7 +51,6 @@ class Scan:
     before: float
     after: float
     after_error: float
-    likelihood: FloatArray
 
 
 def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None:
@@ -93,11 +90,9 @@ def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None
     variance = _variance(rest, weights) * _widening(rest)
     z = np.sqrt(gain / variance)
     b = _as_normal(float(z[k]), n - 2)
-    likelihood = np.full(n + 1, -math.inf)
-    likelihood[places] = 0.5 * z**2
     return Scan(
         place, _chance(b, float(s[0]), float(s[-1])), float(before[k]), float(after[k]),
-        math.sqrt(variance / float(weights[place:].sum())), likelihood,
+        math.sqrt(variance / float(weights[place:].sum())),
     )  # fmt: skip
 
 
@@ -133,47 +128,6 @@ def _chance(b: float, low: float, high: float) -> float:
     spread = math.log(max(high * (1.0 - low) / (low * (1.0 - high)), 1.0))
     density = math.exp(-0.5 * b * b) / math.sqrt(2.0 * math.pi)
     return min(1.0, b * density * ((1.0 - b**-2) * spread + 4.0 * b**-2))
-
-
-def moment_of(
-    times_ns: list[IntArray], scans: list[Scan], share: float = 0.95
-) -> tuple[int, int, int]:
-    """Return the common time of change of several series, with an interval.
-
-    Parameters
-    ----------
-    times_ns : list of int64 (n,)
-        Times of the members of each series.
-    scans : list of Scan
-        One per series, at least one.
-    share : float
-        Probability of the interval.
-
-    Returns
-    -------
-    tuple of int
-        Median, lower and upper end of the distribution of the time, ns. The prior is uniform
-        in time. If the series have no possible time in common they did not change together:
-        then only the series with the smallest p-value is used. 0, 0, 0 if the time cannot
-        be determined.
-    """
-    edges = np.unique(np.concatenate(times_ns))
-    likelihood = np.zeros(len(edges) - 1)
-    for times, found in zip(times_ns, scans, strict=True):
-        # Number of members of this series before a change between two edges.
-        count = np.searchsorted(times, edges[:-1], side='right')
-        likelihood += found.likelihood[count]
-    if not np.isfinite(likelihood).any():
-        if len(scans) == 1:
-            return 0, 0, 0
-        surest = min(range(len(scans)), key=lambda k: scans[k].p_value)
-        return moment_of([times_ns[surest]], [scans[surest]], share)
-    mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
-    reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
-    tail = 0.5 * (1.0 - share)
-    offset = np.interp([0.5, tail, 1.0 - tail], reached, (edges - edges[0]).astype(np.float64))
-    middle, low, high = (int(edges[0]) + int(v) for v in offset)
-    return middle, low, high
 
 
 _MOST_WEIGHT = 900.0
@@ -320,3 +274,77 @@ def after_known_changes(series: SegmentResiduals, known_ns: int) -> SegmentResid
     if found is None or found.p_value > _KNOWN:
         return series
     return series.part(np.arange(found.place, len(series)))
+
+
+def common_change(
+    series: Sequence[SegmentResiduals], known_ns: int, share: float = 0.95
+) -> tuple[int, int, int]:
+    """Return the common time of change of several pieces of a curve, with an interval.
+
+    Each piece has a level before and a level after the time; one member on a side is enough, for
+    the members of all pieces determine the time together.
+
+    Parameters
+    ----------
+    series : sequence of SegmentResiduals
+        One per piece.
+    known_ns : int
+        Earlier changes are not considered.
+    share : float
+        Probability of the interval.
+
+    Returns
+    -------
+    tuple of int
+        Median, lower and upper end of the distribution of the time, ns. The prior is uniform
+        in time. 0, 0, 0 if no common change is seen.
+    """
+    edges = np.unique(np.concatenate([s.time_ns for s in series]))
+    allowed = edges[1:] > known_ns
+    count = sum(len(s) for s in series)
+    freedom = count - 2 * len(series)
+    if freedom < LEAST_SIDE or not allowed.any():
+        return 0, 0, 0
+    gain = np.zeros(len(edges) - 1)
+    before = np.zeros(len(edges) - 1)  # weight of all members before the change
+    sided = np.zeros(len(edges) - 1, dtype=np.int64)  # pieces with members on both sides
+    for s in series:
+        places = np.searchsorted(s.time_ns, edges[:-1], side='right')
+        weight = np.append(0.0, np.cumsum(s.weights))
+        total = np.append(0.0, np.cumsum(s.weights * s.residual_mw))
+        both = (places > 0) & (places < len(s))
+        first, last = weight[places], weight[-1] - weight[places]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            change = (total[-1] - total[places]) / last - total[places] / first
+            gain += np.where(both, first * last / weight[-1] * change**2, 0.0)
+        before += first
+        sided += both
+    gain[~allowed] = 0.0
+    best = int(np.argmax(gain))
+    split_ns = int(edges[best])
+    rest = np.concatenate([_about_levels(s, split_ns) for s in series])
+    weights = np.concatenate([s.weights for s in series])
+    order = np.argsort(np.concatenate([s.time_ns for s in series]), kind='stable')
+    variance = max(float(np.sum(weights * rest**2)) / freedom, _LEAST_VARIANCE)
+    likelihood = np.where(allowed, 0.5 * gain / (variance * _widening(rest[order])), -math.inf)
+    # The tail of chi-square with one level per piece, as the normal deviate of one level.
+    tail = float(chdtrc(max(sided[best], 1), 2.0 * likelihood[best]))
+    normal = float(-ndtri(0.5 * tail)) if tail > 0.0 else _FAR
+    share_before = before[allowed] / sum(float(s.weights.sum()) for s in series)
+    if _chance(normal, float(share_before[0]), float(share_before[-1])) > _KNOWN:
+        return 0, 0, 0
+    mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
+    reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
+    tail = 0.5 * (1.0 - share)
+    offset = np.interp([0.5, tail, 1.0 - tail], reached, (edges - edges[0]).astype(np.float64))
+    middle, low, high = (int(edges[0]) + int(v) for v in offset)
+    return middle, low, high
+
+
+def _about_levels(series: SegmentResiduals, split_ns: int) -> FloatArray:
+    """Return the residuals about the means before and after a time."""
+    rest = series.residual_mw.copy()
+    for part in (series.time_ns <= split_ns, series.time_ns > split_ns):
+        if part.any():
+            rest[part] -= np.average(rest[part], weights=series.weights[part])
+    return rest

@@ -23,7 +23,7 @@ from valveflow_ros.curve.segment_residual import (
     Scan,
     SegmentResiduals,
     after_known_changes,
-    moment_of,
+    common_change,
     scan,
     segment_residuals,
 )
@@ -292,7 +292,8 @@ def judge_shift(
         _judged(reference, current, k, series[k].time_ns, scans[k], tests, limits)
         for k in range(len(current.pieces))
     )
-    since = _since(pieces, series, scans)
+    moved = [s for piece, s in zip(pieces, series, strict=True) if piece.moved and len(s)]
+    since = common_change(moved, reference.source.window_end_ns) if moved else (0, 0, 0)
     begun_ns = since[0] or current.source.window_start_ns - 1
     if len(found):
         least = LEAST_SIDE if since[0] else 1
@@ -465,19 +466,6 @@ def _two_sided(value: float, error: float) -> float:
     if not (math.isfinite(value) and error > 0.0):
         return 1.0
     return float(2.0 * ndtr(-abs(value) / error))
-
-
-def _since(
-    pieces: Sequence[PieceShift], series: Sequence[SegmentResiduals], scans: Sequence[Scan | None]
-) -> tuple[int, int, int]:
-    """Return the common onset of the shifted pieces from their segments."""
-    times: list[IntArray] = []
-    used: list[Scan] = []
-    for piece, residuals, found in zip(pieces, series, scans, strict=True):
-        if piece.moved and math.isfinite(piece.now_mw) and found is not None:
-            times.append(residuals.time_ns)
-            used.append(found)
-    return moment_of(times, used) if used else (0, 0, 0)
 
 
 # The result of the test as JSON: the content of ``shift.json``.

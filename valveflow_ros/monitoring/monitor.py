@@ -384,6 +384,7 @@ class Monitor(Memory):
         if self._went_back:
             self._went_back = False
             self._window.go_back(int(rows.time_ns[0]))
+            self.reference.go_back(int(rows.time_ns[0]))
         self._window.append(
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
             rows.command_percent,

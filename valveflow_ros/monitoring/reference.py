@@ -169,7 +169,8 @@ class ReferenceCurve:
                 self.problem, time_ns, current.model_id, settings
             )  # fmt: skip
         if self.shift.moved and not self.alarm.active:
-            self._since_ns = self.shift.since_low_ns
+            # The latest possible time: a curve of rows since then has none of the healthy plant.
+            self._since_ns = self.shift.since_high_ns
         return self.shift, self.alarm.judge(self.shift, time_ns, settings)
 
     def follow(self, onset_ns: int | None, waits: bool, time_ns: int) -> bool:
@@ -188,7 +189,8 @@ class ReferenceCurve:
         if self.alarm.active:
             onsets.append(self._since_ns)
         if onsets:
-            begins, known = self.fault_ns is None, [ns for ns in onsets if ns]
+            # A later onset is of the clock before it went back: now it is unknown.
+            begins, known = self.fault_ns is None, [ns for ns in onsets if 0 < ns <= time_ns]
             self._healthy_ns = self.regime_ns if begins else self._healthy_ns
             self.fault_ns, self._candidate = min(known, default=0), None
             self.regime_ns = max(self._healthy_ns, self.fault_ns)
@@ -196,6 +198,11 @@ class ReferenceCurve:
         if self.fault_ns is not None and not waits:
             self.fault_ns, self.regime_ns = None, time_ns
         return False
+
+    def go_back(self, time_ns: int) -> None:
+        """Let fits use the rows from ``time_ns`` on, to which the clock went back."""
+        self.regime_ns = min(self.regime_ns, time_ns)
+        self._healthy_ns = min(self._healthy_ns, time_ns)
 
     def renewed(
         self, current: Characteristic, time_ns: int, settings: Settings
