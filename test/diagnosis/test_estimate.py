@@ -7,16 +7,20 @@ from __future__ import annotations
 import math
 from datetime import datetime, timezone
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Estimate, FittedCause, dates
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.evidence import Gain
+from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.result import NamedCause, cause_json
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.diagnosis import cells, times_in_effect
+from valveflow_ros.signals.static_form import OPENING, StaticForm
 
 # 2025-03-01 00:00 UTC
 ORIGIN_NS = 1_740_787_200 * NS_PER_S
@@ -105,3 +109,19 @@ def test_what_is_switched_in_and_out_has_times_of_its_own():
     many = times_in_effect([600.0 * k for k in range(50)], ORIGIN_NS, end_ns)
     assert many.count(' to ') == 20
     assert many.endswith('; and 5 times more')
+
+
+def test_a_place_on_the_curve_is_told_in_mw_or_as_an_opening():
+    knots = np.array([1000.0, 2000.0])
+    base = RegionalModel(
+        knots, np.array([100.0]), np.array([300.0]), np.empty(0), np.array([10.0]), np.zeros(1)
+    )
+    step = FittedCause(catalogue()['curve_step'], STEPS['curve_step'])
+    model = Extended(base, (step,))
+    by_power = step.sentence(ORIGIN_NS, place=model.place_words(StaticForm()))
+    assert 'gives 4 MW less above 240 MW than before, and the same below 200 MW' in by_power
+    assert model.place_words(StaticForm())(9e9) == '300 MW'  # beyond the curve
+    by_opening = model.place_words(StaticForm(OPENING, 1.0))
+    assert 'above 62.5 % opening than' in FittedCause(
+        step.cause, (-4.0, 50.0, 62.5, 3.5)
+    ).sentence(ORIGIN_NS, place=by_opening)  # fmt: skip

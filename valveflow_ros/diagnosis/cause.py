@@ -190,6 +190,9 @@ class Unknown:
         return self.step * (grids.size if self.unit.startswith('MW') else 1.0)
 
 
+_BY_U = 'u = {:.4g}'.format
+
+
 class SentenceValues(dict[str, float]):
     """Parameter values by name, for a sentence.
 
@@ -199,13 +202,16 @@ class SentenceValues(dict[str, float]):
         Date of the onset with its interval; empty for a cause without an onset.
     unsure : frozenset of str
         Names of values that are smaller than their standard error.
+    place : callable
+        Returns a value of u in words of an operator.
     """
 
     def __init__(
-        self, values: Mapping[str, float], onset: str = '', unsure: Iterable[str] = ()
-    ) -> None:
+        self, values: Mapping[str, float], onset: str = '', unsure: Iterable[str] = (),
+        place: Callable[[float], str] = _BY_U,
+    ) -> None:  # fmt: skip
         super().__init__(values)
-        self.onset = onset
+        self.onset, self.place = onset, place
         self.unsure = frozenset(unsure)
 
 
@@ -319,7 +325,10 @@ class FittedCause:
                 ).replace('  ', ' ')
         return ''
 
-    def sentence(self, start_ns: int, estimates: Mapping[str, Estimate] | None = None) -> str:
+    def sentence(
+        self, start_ns: int, estimates: Mapping[str, Estimate] | None = None,
+        place: Callable[[float], str] = _BY_U,
+    ) -> str:  # fmt: skip
         """Return a sentence about the fault for an operator.
 
         Parameters
@@ -328,6 +337,8 @@ class FittedCause:
             Time of the first row, ns since 1970 UTC.
         estimates : mapping, optional
             The values with their intervals, by name; without them no intervals are reported.
+        place : callable, optional
+            Returns a value of u in words of an operator.
         """
         values, onset = self.named(), ''
         for u in self.cause.unknowns:
@@ -339,4 +350,4 @@ class FittedCause:
             name for name, e in (estimates or {}).items()
             if e.high - e.low > 2.0 * _Z95 * abs(e.value)
         ]  # fmt: skip
-        return self.cause.sentence(SentenceValues(values, onset, unsure))
+        return self.cause.sentence(SentenceValues(values, onset, unsure, place))

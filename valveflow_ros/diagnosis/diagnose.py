@@ -618,12 +618,15 @@ def _conclude(
     task, final = _final(found)
     progress(0.9, 'how sure it is')
     estimates = Certainty(task, final).intervals() if final.active else {}
-    sentences = {a.name: a.sentence(grids.start_ns, estimates[a.name]) for a in final.active}
+    place = final.place_words(grids.form)
+    sentences = {
+        a.name: a.sentence(grids.start_ns, estimates[a.name], place) for a in final.active
+    }
     other = _other_bend(task, final, found)
     if other:
         one = next(a.named() for a in final.active if a.name == 'curve_shape')
         values = {name: e.value for name, e in other.items()}
-        sentences['curve_shape'] = either_bend_sentence(one, values)
+        sentences['curve_shape'] = either_bend_sentence(one, values, place)
         estimates['curve_shape'] = _either(estimates['curve_shape'], other)
     causes = tuple(
         NamedCause(

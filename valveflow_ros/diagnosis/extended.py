@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +63,13 @@ class Extended:
         for a in self.at(Stage.DYNAMICS):
             model = a.cause.act(model, a.values)
         return model
+
+    def place_words(self, form: StaticForm) -> Callable[[float], str]:
+        """Return a function of u: that place on the curve in words, as power or as opening."""
+        if form.input_exponent == 0.0:
+            return '{:.1f} % opening'.format
+        knots = self.base.knots
+        return lambda u: f'{self.base.static(np.clip([u], knots[0], knots[-1]))[0]:.0f} MW'
 
     def without_causes(self) -> Extended:
         """Return the model without its causes."""
@@ -211,11 +219,12 @@ class ExtendedModel:
     def held(self) -> tuple[HeldCause, ...]:
         """Return the causes, those of the earlier model first."""
         earlier = () if self.on_top_of is None else self.on_top_of.held
+        place = self.model.place_words(self.form)
         return earlier + tuple(
             HeldCause(
                 a.name,
                 tuple(a.named().items()),
-                in_unit(a.sentence(self.start_ns), self.output_unit),
+                in_unit(a.sentence(self.start_ns, place=place), self.output_unit),
             )
             for a in self.model.active
         )

@@ -21,6 +21,7 @@ from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import notice, paragraph, table, text
 from valveflow_ros.report.words import (
     NOT_KNOWN,
+    Z95,
     count,
     counted,
     decimals,
@@ -140,7 +141,7 @@ def gain_by_load(data: Identified) -> list[tuple[float, float, float, float, flo
         at = int(np.clip(np.searchsorted(c.breakpoints, u) - 1, 0, len(c.pieces) - 1))
         per_percent = p ** (c.pressure_exponent + c.pressure_scale_exponent)
         piece = c.pieces[at]
-        error = 1.96 * piece.slope_stderr * per_percent
+        error = Z95 * piece.slope_stderr * per_percent
         rows.append((float(load), p, v, piece.slope * per_percent, error))
     return rows
 
@@ -237,7 +238,7 @@ def pieces_table(data: Identified) -> str:
         ])  # fmt: skip
     head = [
         'piece', f'{u} ({input_unit(m)})', f'power{data.at_pressure} (MW)',
-        f'slope ± standard error ({per_input(m)})', 'intercept ± standard error (MW)',
+        f'slope, 95 % ({per_input(m)})', 'intercept, 95 % (MW)',
         'samples', *(['rests on'] if c.support else []),
     ]  # fmt: skip
     return table(head, rows)
@@ -304,7 +305,12 @@ def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
         ]
         for d in dynamics
     ]
-    head = ['power', 'time constant T (s)', 'delay τ (s)', '95 % done after τ + 3 T (s)']
+    head = [
+        'power',
+        'time constant T, 95 % (s)',
+        'delay τ, 95 % (s)',
+        '95 % done after τ + 3 T (s)',
+    ]
     return table(head, rows)
 
 

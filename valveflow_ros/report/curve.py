@@ -32,6 +32,7 @@ from valveflow_ros.report.figure import (
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Section, notice, paragraph, table, text
 from valveflow_ros.report.words import (
+    Z95,
     counted,
     decimals,
     input_axis,
@@ -43,7 +44,6 @@ from valveflow_ros.report.words import (
 )
 from valveflow_ros.signals.static_form import OPENING
 
-_Z95 = 1.959963984540054
 _SHADES = 5
 _COLUMNS, _ROWS = 150, 100
 _DAY_NS = 86400 * 10**9
@@ -244,7 +244,7 @@ def _bands(data: Identified, u_samples: FloatArray) -> list[Spec]:
     traces: list[Spec] = []
     for piece in data.shown.pieces:
         u = np.linspace(piece.u_from, piece.u_to, 25)
-        error = _Z95 * band(piece, u_samples, u)
+        error = Z95 * band(piece, u_samples, u)
         if np.all(np.isfinite(error)):
             middle = piece.slope * u + piece.intercept
             edge = np.append(middle + error, (middle - error)[::-1])

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 UNKNOWN = 'unknown'
 NOT_KNOWN = 'not known'
 _MINUS = '−'
+Z95 = 1.959963984540054
 
 
 def plain(value: float, digits: int = 4) -> str:
@@ -75,17 +76,18 @@ def places_for(error: float, digits: int = 2) -> int:
 
 
 def with_error(value: float, error: float, unit: str = '') -> str:
-    """Return 'value ± error', both rounded to two digits of the error.
+    """Return 'value ± half of its 95 % interval', both rounded to two digits of that.
 
-    If the error is unknown, return the value with four digits.
+    ``error`` is the standard error. If it is unknown, return the value with four digits.
     """
     tail = f' {unit}' if unit else ''
     if not math.isfinite(value):
         return UNKNOWN
     if not math.isfinite(error) or error <= 0.0:
         return plain(value) + tail
-    places = places_for(error)
-    return f'{decimals(value, places)} ± {decimals(error, places)}{tail}'
+    half = Z95 * error
+    places = places_for(half)
+    return f'{decimals(value, places)} ± {decimals(half, places)}{tail}'
 
 
 def is_known(value: float, error: float) -> bool:

@@ -140,7 +140,7 @@ def _text(found: Identified) -> str:
         _pieces(found),
         _breakpoints(found.shown),
         _dynamics(c),
-        'Behind ± stands one standard error; 95 % lie within 1.96 of them.',
+        'Behind ± stands half of the 95 % interval.',
         f'Found in {counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")}, '
         f'{counted(c.source.samples, "sample")}. Typical difference '

@@ -44,10 +44,10 @@ TO_DO = {
         'controller that removes the bend.'
     ),
     'curve_step': (
-        'Look at the valve that opens at `u_from`: its lift, its servo, its linkage, the broken '
-        'stem. Look into the log of the controller for a changed sequence at the time named. '
-        'Watch vibration and metal temperatures: with one valve shut the others and the first '
-        'stage are loaded unevenly.'
+        'Look at the valve that begins to open where the change begins: its lift, its servo, its '
+        'linkage, the broken stem. Look into the log of the controller for a changed sequence at '
+        'the time named. Watch vibration and metal temperatures: with one valve shut the others '
+        'and the first stage are loaded unevenly.'
     ),
     'diurnal': (
         'Usually not a fault: cold cooling water in the night, warm in the afternoon. Log the '

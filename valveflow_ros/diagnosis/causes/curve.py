@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,23 +73,26 @@ def _levels_under(base: RegionalModel, values: Values, scale: float) -> Regional
     return base.with_levels(levels) if np.all(np.diff(levels) > 0.0) else base
 
 
-def curve_shape_sentence(values: dict[str, float]) -> str:
+def curve_shape_sentence(values: SentenceValues) -> str:
     """Return the sentence for the operator."""
-    return f'The curve has {_bend(values)} that straight pieces do not follow (overlap of valves).'
+    bend = _bend(values, values.place)
+    return f'The curve has {bend} that straight pieces do not follow (overlap of valves).'
 
 
-def either_bend_sentence(one: dict[str, float], other: dict[str, float]) -> str:
+def either_bend_sentence(
+    one: dict[str, float], other: dict[str, float], place: Callable[[float], str]
+) -> str:
     """Return the sentence for a bend whose sign is uncertain."""
     return (
         'The curve has a bend that straight pieces do not follow (overlap of valves): '
-        f'{_bend(one)} and {_bend(other)} explain the record about equally well.'
+        f'{_bend(one, place)} and {_bend(other, place)} explain the record about equally well.'
     )
 
 
-def _bend(values: dict[str, float]) -> str:
+def _bend(values: dict[str, float], place: Callable[[float], str]) -> str:
     return (
         f'a {"bump" if values["h_mw"] > 0.0 else "dent"} of '
-        f'{abs(values["h_mw"]):.2g} MW around u = {values["u0"]:.4g}'
+        f'{abs(values["h_mw"]):.2g} MW at {place(values["u0"])}'
     )
 
 
@@ -143,10 +146,10 @@ def curve_step_sentence(values: SentenceValues) -> str:
     """Return the sentence for the operator."""
     full = max(values['u_from'], values['u_to'])  # a step if u_from is not below u_to
     return (
-        f'From {values.onset} the curve is {abs(values["s_mw"]):.2g} MW '
-        f'{"lower" if values["s_mw"] < 0.0 else "higher"} above u = {full:.4g} and unchanged '
-        'below '
-        f'u = {values["u_from"]:.4g} (a valve that sticks, or another order of opening).'
+        f'From {values.onset} the unit gives {abs(values["s_mw"]):.2g} MW '
+        f'{"less" if values["s_mw"] < 0.0 else "more"} above {values.place(full)} than before, '
+        f'and the same below {values.place(values["u_from"])} (a valve that sticks, or another '
+        'order of opening).'
     )
 
 
