@@ -174,9 +174,9 @@ def answer_words(data: Identified) -> str:
     c = data.shown
     ends, values, m = c.breakpoints, c.values(), c.pressure_exponent
     words = (
-        f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known for '
-        f'{input_name(m)} from {span(ends[0], ends[-1])} {input_unit(m)}, that is from '
-        f'{span(values[0], values[-1])} MW{data.at_pressure}.{_bends(c)} It explains '
+        f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known from '
+        f'{span(values[0], values[-1])} MW{data.at_pressure} ({input_name(m)} from '
+        f'{span(ends[0], ends[-1])} {input_unit(m)}).{_bends(c)} It explains '
         f'{percent(explained(data))} of the variance of the power in '
         f'{counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")} '
@@ -206,21 +206,17 @@ def answer_words(data: Identified) -> str:
 
 def _bends(c: Characteristic) -> str:
     """Return what the shape of the curve means for control."""
-    u, per = input_name(c.pressure_exponent), per_input(c.pressure_exponent)
     if len(c.pieces) == 1:
-        return f' It is straight: {plain(c.pieces[0].slope)} {per} everywhere.'
+        return ' It is straight.'
     steep = max(c.pieces, key=lambda p: p.slope)
     flat = min(c.pieces, key=lambda p: p.slope)
-    said = (
-        f' The power rises most between {u} = {level(steep.u_from, 0)} and '
-        f'{level(steep.u_to, 0)} ({plain(steep.slope, 3)} {per})'
-    )
-    there = f'between {level(flat.u_from, 0)} and {level(flat.u_to, 0)}'
+    said = f' The power rises most steeply at {c.place_words(steep.u_from, steep.u_to)}'
+    there = c.place_words(flat.u_from, flat.u_to)
     if flat.slope <= 0.0:
-        return f'{said}; {there} opening further <b>does not raise the power</b>.'
+        return f'{said}; at {there} opening further <b>does not raise the power</b>.'
     weak = ': there the valve hardly changes the power' if flat.slope < _FLAT * steep.slope else ''
     times = plain(steep.slope / flat.slope, 2)
-    return f'{said}, and {times} times less {there} ({plain(flat.slope, 3)}){weak}.'
+    return f'{said}, and {times} times less at {there}{weak}.'
 
 
 def pieces_table(data: Identified) -> str:
