@@ -353,7 +353,7 @@ def time_ns(text: str) -> int:
     except ValueError:
         raise UsageError(f"'{text}' is no time such as 2026-01-31T06:00Z.") from None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-    return round(moment.timestamp()) * 1_000_000_000
+    return round(moment.timestamp() * 1e6) * 1000
 
 
 def lines(*parts: str) -> str:

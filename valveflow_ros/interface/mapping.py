@@ -22,7 +22,7 @@ from valveflow_ros.logs.tables.refusal import (
 )
 from valveflow_ros.logs.tables.words import unit_named
 from valveflow_ros.records import SIGNALS, Signal, zone_of
-from valveflow_ros.signals.units import convert, known_units
+from valveflow_ros.signals.units import convert, known_units, units_of
 
 Answer = TypeVar('Answer')
 _TIMES = ('time', 'date')
@@ -113,10 +113,10 @@ class LogMapping:
             unknown = next((c for c in self.columns.values() if not c.known), None)
             if unknown is None:
                 raise
-            units = ', '.join(known_units(_BY_NAME[unknown.name].signal))
+            units = units_of(_BY_NAME[unknown.name].signal, unknown.unit)
             raise UsageError(
-                f"Unit '{unknown.unit}' is unknown for {unknown.name}: use one of {units} "
-                f"(and the log has nothing called '{unknown.whole}')."
+                f"Unit '{unknown.unit}' is unknown for {unknown.name}: {units}. The log has "
+                f"nothing called '{unknown.whole}' either."
             ) from error
 
     def unit_of(self, signal: Signal, told: dict[Signal, str]) -> str:

@@ -115,7 +115,9 @@ class TopicChoice:
         Raises
         ------
         InputError
-            If several topics match a signal, or a wanted topic is missing or of another type.
+            If several topics match a signal, or a wanted topic is missing.
+        RecordingError
+            If a wanted topic is of another type.
         """
         chosen: dict[str, Signal] = {}
         for info in SIGNALS:

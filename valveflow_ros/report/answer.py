@@ -102,8 +102,8 @@ def form_words(c: Characteristic) -> str:
     if c.axis != OPENING:
         return ''
     return (
-        f'The breakpoints of this valve are at fixed openings: the power follows {mine} with c = '
-        f'{decimals(c.offset_mw, 1)} MW. On held-out data the error of this form is '
+        f'The breakpoints of this valve are at fixed openings: the power follows {mine}. On '
+        'held-out data the error of this form is '
         f'{plain(form.rmse_mw, 2)} MW, that of {form.other} {plain(form.rmse_other_mw, 2)} MW.'
     )
 

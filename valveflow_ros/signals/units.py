@@ -142,8 +142,18 @@ def unit_of(signal: Signal, name: str) -> Unit:
     for spelling, unit in known_units(signal).items():
         if spelling.lower() == name.strip().lower():
             return unit
-    known = ', '.join(known_units(signal))
-    raise InputError(f"Unit '{name}' is unknown for {SIGNALS[signal].topic}: use one of {known}.")
+    units = units_of(signal, name)
+    raise InputError(f"Unit '{name}' is unknown for {SIGNALS[signal].topic}: {units}.")
+
+
+def units_of(signal: Signal, name: str) -> str:
+    """Return the units of a signal, and of which other signals ``name`` is a unit, in words."""
+    others = [
+        info.topic for info in SIGNALS
+        if any(name.strip().lower() == known.lower() for known in known_units(info.signal))
+    ]  # fmt: skip
+    theirs = f" ('{name}' is a unit of {' and '.join(others)})" if others else ''
+    return f'use one of {", ".join(known_units(signal))}{theirs}'
 
 
 def convert(signal: Signal, name: str, values: FloatArray) -> FloatArray:

@@ -181,7 +181,7 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
     at = here[task.rows]
     if whole or near:
         change = _curve_change(given, curve, at, hats, () if whole else (best, *near), least)
-        sure = True
+        sure = _somewhere(curve, at, hats, least)
     else:
         change = _change(best, given, changed, value, fit, at, moved[task.rows], least)
         sure = all(_is_sure(e) for e in change.parameters.values())
@@ -302,9 +302,7 @@ def _curve_change(
     parameters, told = {}, []
     for name, share in (('low_load_mw', _LOW), ('high_load_mw', _HIGH)):
         load = float(np.quantile(here, share))
-        row = np.array([np.interp(load, hats, one) for one in np.eye(_HATS)])
-        value = float(row @ fit.coefficients)
-        error = math.hypot(_Z95 * math.sqrt(float(row @ fit.covariance @ row)), least)
+        value, error = _at_load(fit, load, hats, least)
         parameters[name] = Estimate(value, value - error, value + error, 'MW')
         told.append(
             f'by {value:+.2g} MW or {100.0 * value / load:+.2g} % (95 % interval '
@@ -315,3 +313,16 @@ def _curve_change(
         f'{" and ".join(told)}; {_BEFORE}.'
     )
     return Change(CURVE, given, given, parameters, sentence, near=near)
+
+
+def _at_load(fit: Regression, load: float, hats: FloatArray, least: float) -> tuple[float, float]:
+    """Return the change of the curve at a load, and half of its 95 % interval."""
+    row = np.array([np.interp(load, hats, one) for one in np.eye(_HATS)])
+    error = math.hypot(_Z95 * math.sqrt(float(row @ fit.covariance @ row)), least)
+    return float(row @ fit.coefficients), error
+
+
+def _somewhere(fit: Regression, here: FloatArray, hats: FloatArray, least: float) -> bool:
+    """Return True if the change of the curve is larger than its error at some load."""
+    loads = np.quantile(here, np.linspace(_LOW, _HIGH, 2 * _HATS - 1)).tolist()
+    return any(abs(mw) > error for mw, error in (_at_load(fit, x, hats, least) for x in loads))
