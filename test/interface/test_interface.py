@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ import valveflow_ros as vf
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
 from valveflow_ros.logs import write_samples, write_table
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.report.words import moment, percent
 
 QUICK = {'refine': False, 'selection_rule': 'paper'}
 HEAVY = {'numpy', 'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'yaml'}
@@ -302,7 +304,10 @@ class TestMonitor:
     def test_report_and_picture(self, told, tmp_path):
         assert set(told.write(tmp_path).files) == {'monitor.json', 'report.html'}
         page = (tmp_path / 'report.html').read_text()
-        parts = ['The answer', 'How the curve moved', 'What the monitor said']
+        parts = [
+            'The answer', 'How near the residual came to an alarm', 'How the curve moved',
+            'What the monitor said',
+        ]  # fmt: skip
         places = [page.index(f'<h2>{part}</h2>') for part in parts]
         assert places == sorted(places)
         # What stands at the end and the named cause come before any picture.
@@ -316,6 +321,25 @@ class TestMonitor:
         model_id = told.to_json()['reference']['model_id']
         assert f'is curve {model_id}, from data of 20' in told.reference_words
         assert len(told.plot('alarms').data) > 0
+
+    def test_how_near_an_alarm_was_is_told_without_the_alarm_itself(self, told):
+        rows, (alarm, *_) = told.predictions(), told.to_json()['alarms']
+        assert (alarm['name'], alarm['cleared']) == ('residual', None)
+        at, share = told.largest_evidence
+        assert told.to_json()['largest_evidence'] == {'time': at, 'share': share}
+        evidence = np.abs(rows['evidence'])
+        assert evidence[np.flatnonzero(rows['time_ns'] == at)[0]] == share
+        assert at < alarm['raised']
+        assert 0.0 < share < 1.0 < np.nanmax(evidence)
+        words = told.evidence_words
+        assert f'at most {percent(share)} of its limit, at {moment(at)}.' in words
+        page = told.page().to_html()
+        assert words in page
+        # Evidence that did not last has its own sentence.
+        early = [e for e in told.events if getattr(e, 'name', '') != 'residual']
+        without = replace(told, events=tuple(early))
+        assert without.largest_evidence[1] > 1.0
+        assert 'but not for alarm_on_delay (15 min).' in without.evidence_words
 
     def test_it_says_what_the_engine_fed_in_one_go_says(self, log):
         from valveflow_ros.interface.observation import settings_for

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
 from valveflow_ros.monitoring.alarm_state import AlarmChange, AlarmState
+from valveflow_ros.monitoring.alarms import ResidualAlarm
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Diagnosed,
@@ -40,7 +41,7 @@ from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import Wear
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import FloatArray, IntArray, SampleTable
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import (
     AlarmMoment,
@@ -49,17 +50,29 @@ from valveflow_ros.report.history import (
     History,
     Moment,
     alarms_of,
+    evidence_figure,
     history_of,
     history_sections,
+    largest_evidence,
     moment_of,
+    standing,
 )
 from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
-from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment, signed
+from valveflow_ros.report.words import (
+    VERDICT_WORDS,
+    advice,
+    counted,
+    duration,
+    moment,
+    percent,
+    signed,
+)
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 
 # Switches the diagnoses off: each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
+_RESIDUAL = ResidualAlarm.NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,10 +165,57 @@ class MonitorResult(Result):
 
     def predictions(self) -> dict[str, IntArray | FloatArray]:
         """Return the predictions as arrays of shape (rows,), named as in `PredictionBlock`."""
-        blocks = [e for e in self.events if isinstance(e, PredictionBlock)]
         names = ('time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
                  'average_mw', 'evidence', 'shift_mw', 'state')  # fmt: skip
+        return self._predicted(names)
+
+    def _predicted(self, names: Sequence[str]) -> dict[str, Any]:
+        blocks = [e for e in self.events if isinstance(e, PredictionBlock)]
         return {n: np.concatenate([getattr(b, n) for b in blocks]) for n in names if blocks}
+
+    def _judged(self) -> tuple[IntArray, FloatArray, FloatArray] | None:
+        """Return time, mean residual and evidence, NaN where the alarm does not judge.
+
+        The result is in the order of time, and None if nothing was judged.
+        """
+        rows = self._predicted(('time_ns', 'residual_mw', 'average_mw', 'evidence'))
+        if not rows:
+            return None
+        order = np.argsort(rows['time_ns'], kind='stable')  # the clock may have gone back
+        time_ns, residual, average, evidence = (column[order] for column in rows.values())
+        judged = np.isfinite(residual) & np.isfinite(evidence)
+        if not judged.any():
+            return None
+        return time_ns, np.where(judged, average, np.nan), np.where(judged, evidence, np.nan)
+
+    @property
+    def largest_evidence(self) -> tuple[int, float] | None:
+        """Return the time (ns) and the largest evidence of the residual alarm outside alarms.
+
+        The evidence is a share of the limit; None if there were no such rows.
+        """
+        judged = self._judged()
+        if judged is None:
+            return None
+        time_ns, _, evidence = judged
+        return largest_evidence(time_ns, evidence, standing(self.history(), _RESIDUAL))
+
+    @property
+    def evidence_words(self) -> str:
+        """Return a sentence on how near the residual came to an alarm; empty if not judged."""
+        largest = self.largest_evidence
+        if largest is None:
+            return ''
+        at, share = largest
+        delay = duration(self.settings.real('alarm_on_delay'))
+        short = (
+            f' It was beyond the limit, but not for alarm_on_delay ({delay}).'
+            if share > 1.0 else ''
+        )  # fmt: skip
+        return (
+            f'Outside alarms, the evidence of the residual alarm reached at most '
+            f'{percent(share)} of its limit, at {moment(at)}.{short}'
+        )
 
     def history(self) -> History:
         """Return curves, alarms and diagnoses as the reports show them."""
@@ -175,12 +235,28 @@ class MonitorResult(Result):
         lead = paragraph(text(self.source), 'where')
         lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
         lead += paragraph(text(f'{self.reference_words} {self.wear_words}'), 'where')
-        sections = [Section('The answer', self._answer()), *history_sections(self.history())]
+        sections = [Section('The answer', self._answer()), *self._nearness()]
+        sections += history_sections(self.history())
         foot = (
             f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
             'monitor.json beside this page.'
         )
         return Page('What the monitor would have told', lead, sections, foot, self.verb)
+
+    def _nearness(self) -> list[Section]:
+        """Return the section on how near the residual came to an alarm; none if not judged."""
+        judged = self._judged()
+        if judged is None:
+            return []
+        time_ns, average_mw, evidence = judged
+        figure = evidence_figure(
+            time_ns, average_mw, evidence, standing(self.history(), _RESIDUAL),
+            round(self.settings.real('sample_period') * NS_PER_S),
+            self.settings.real('alarm_limit'),
+        )  # fmt: skip
+        words = self.evidence_words
+        parts: list[str | Figure] = [paragraph(words)] if words else []
+        return [Section('How near the residual came to an alarm', [*parts, figure])]
 
     def _answer(self) -> list[str | Figure]:
         """Return the state at the end, its reasons as far as known, and every diagnosis."""
@@ -213,11 +289,21 @@ class MonitorResult(Result):
         return [words for words in told if words]
 
     def texts(self) -> dict[str, str]:
-        """Return ``monitor.json``; times are ns since 1970."""
+        """Return ``monitor.json``; times are ns since 1970.
+
+        ``largest_evidence`` is that of the residual alarm outside alarms, as a share of its limit.
+        """
+        largest = self.largest_evidence
         content = {
             'format': 'valveflow/monitor',
             'version': 1,
             'alarms': self._alarms_json(),
+            'largest_evidence': None
+            if largest is None
+            else {
+                'time': largest[0],
+                'share': largest[1],
+            },
             'curves': [
                 {
                     'adopted': at,

@@ -100,6 +100,7 @@ def _text(found: MonitorResult) -> str:
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
         columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
         *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
+        found.evidence_words,
         columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
         *(d['sentence'] for _, d in found.diagnoses[-1:]),
         *found.advice,
