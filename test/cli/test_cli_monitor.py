@@ -67,11 +67,32 @@ def test_each_diagnosis_is_told_with_its_time_and_each_cause_once(
         ['1970-01-01 02:00:00 UTC', 'cause found', 'gain_step'],
         ['1970-01-02 06:00:00 UTC', 'cause found', 'gain_step, spikes'],
     ]
-    assert told[first + 4 : first + 7] == [
-        'Last.',
+    assert told[first + 4 : first + 9] == [
+        'gain_step was named by 2 of 3 diagnoses, first with data up to 1970-01-01 02:00:00 UTC.',
+        'spikes was named by 1 of 3 diagnoses, first with data up to 1970-01-02 06:00:00 UTC.',
+        'The last diagnosis: Last.',
         'gain_step: It is 3 MW less. What to do: Look at the meter.',
         'spikes. What to do: Mend the wire.',
     ]
+
+
+def test_a_cause_that_the_last_diagnosis_does_not_name_is_in_the_answer(
+    run, logs, tmp_path, monkeypatch
+):
+    events = (
+        ended(1, 'named', 'First.', gain_step=('It is 2 MW less.', 'Look at the meter.')),
+        ended(2, 'nothing', 'All agrees.'),
+    )
+    made = interface.MonitorResult('plant.csv', events, 0, 31 * HOUR_NS, Settings())
+    monkeypatch.setattr(interface, 'monitor', lambda log, **_: made)
+    told = run('monitor', logs / 'plant.csv', '-o', tmp_path).out
+    sentence = (
+        'gain_step was named by 1 of 2 diagnoses, first with data up to 1970-01-01 01:00:00 UTC. '
+        'The last one does not name it.'
+    )
+    assert f'{sentence}\nThe last diagnosis: All agrees.' in told
+    page = (tmp_path / 'report.html').read_text()
+    assert page.index(sentence) < page.index('The last diagnosis: All agrees.')
 
 
 def test_slow_wear_is_told(run, logs, tmp_path, monkeypatch):

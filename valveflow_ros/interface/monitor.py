@@ -272,6 +272,7 @@ class MonitorResult(Result):
             parts.append(paragraph(known + gone, '' if gone or not curves else 'good'))
         if not self.diagnoses:
             return parts
+        parts += [paragraph(text(told)) for told in self.named]
         parts.append(paragraph(f'The last diagnosis: {text(self.diagnoses[-1][1]["sentence"])}'))
         parts += [paragraph(text(told)) for told in self.advice]
         rows = [
@@ -280,6 +281,21 @@ class MonitorResult(Result):
         ]
         body = table(['data up to', 'verdict', 'what it said'], rows, sentences=True)
         return [*parts, folded(counted(len(rows), 'diagnosis', 'diagnoses'), body)]
+
+    @property
+    def named(self) -> list[str]:
+        """Return a sentence on each cause that any diagnosis named: how often, and first when."""
+        times: dict[str, list[int]] = {}
+        for at, d in self.diagnoses:
+            for cause in d['causes']:
+                times.setdefault(cause['name'], []).append(at)
+        total = counted(len(self.diagnoses), 'diagnosis', 'diagnoses')
+        return [
+            f'{name} was named by {len(found)} of {total}, first with data up to '
+            f'{moment(found[0])}.'
+            + ('' if found[-1] == self.diagnoses[-1][0] else ' The last one does not name it.')
+            for name, found in times.items()
+        ]
 
     @property
     def advice(self) -> list[str]:
