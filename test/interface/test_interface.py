@@ -17,6 +17,7 @@ from extended_file import write_extended
 from streams import needs_jit
 
 import valveflow_ros as vf
+from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
 from valveflow_ros.logs import write_samples, write_table
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
@@ -275,9 +276,34 @@ def test_a_diagnosis_names_extends_and_writes(tmp_path):
 class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
-    def told(cls):
+    def heard(cls):
+        class Heard(vf.Progress):
+            def __init__(self):
+                self.told = []
+
+            def __call__(self, share, what):
+                self.told.append((share, what))
+
+        return Heard()
+
+    @pytest.fixture(scope='class')
+    @classmethod
+    def told(cls, heard):
         faulty = vf.simulate(1.2, 5, effects=['gain_step:g=-0.05,t0_days=0.8']).log
-        return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40})
+        return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40}, progress=heard)
+
+    def test_progress_follows_the_rows_and_names_each_fit_and_diagnosis(self, told, heard):
+        shares = [share for share, _ in heard.told]
+        assert shares == sorted(shares)
+        assert max(np.diff(shares)) < 0.3
+        assert shares[-1] == pytest.approx(0.95)
+        words = [what for _, what in heard.told]
+        (at, _), first = told.diagnoses[0], told.curves[0][0]
+        assert f'diagnosis 1, data up to {minute(at)}' in words
+        fits = [what for what in words if what.startswith('fit ')]
+        assert len(fits) >= len(told.curves)
+        assert f'data up to {minute(first)}' in ' '.join(fits)
+        assert words[-1].startswith('monitoring, data up to ')
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()

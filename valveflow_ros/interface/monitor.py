@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ import numpy as np
 
 from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import minute
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import Result
-from valveflow_ros.interface.logs import as_log
+from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
@@ -426,15 +428,34 @@ def monitor(
     aligner, engine = Aligner(settings), Monitor(settings, corrector)
     events: list[Event] = [] if reference is None else engine.set_reference(reference)
     tables: list[SampleTable] = []
-    for aligned in aligned_blocks(aligner, log.readings, progress, 'monitoring'):
+    tell = _progress_by_time(log, progress)
+    for aligned in aligned_blocks(aligner, log.readings, None, ''):
         tables.append(aligned.table)
-        events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text)
+        events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text, tell)
+        if len(aligned.table):
+            tell(int(aligned.table.time_ns[-1]), '')
     table = SampleTable.concatenate(tables)
     check_signals(table, aligner.counts())
     times = table.time_ns
     return MonitorResult(
         log.name, tuple(events), int(times[0]), int(times[-1]), settings, engine.reference.wear
     )
+
+
+def _progress_by_time(log: Log, progress: Progress) -> Callable[[int, str], None]:
+    """Return a function that reports how far the rows are, and the fit or diagnosis computed."""
+    times = log.readings.time_ns
+    # Single readings may have a wrong time.
+    first, last = np.quantile(times, (0.01, 0.99)) if len(times) else (0.0, 0.0)
+    begun: Counter[str] = Counter()
+
+    def tell(time_ns: int, what: str) -> None:
+        begun[what] += 1
+        name = f'{what} {begun[what]}' if what else 'monitoring'
+        share = min(max((time_ns - first) / max(last - first, 1.0), 0.0), 1.0)
+        progress(0.1 + 0.85 * share, f'{name}, data up to {minute(time_ns)}')
+
+    return tell
 
 
 def _curve_moment(time_ns: int, c: Characteristic) -> CurveMoment:
