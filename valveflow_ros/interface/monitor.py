@@ -29,7 +29,8 @@ from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
 from valveflow_ros.monitoring.alarm_state import AlarmChange, AlarmState
-from valveflow_ros.monitoring.alarms import ResidualAlarm
+from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
+from valveflow_ros.monitoring.diagnosis_requests import onset_ns
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Diagnosed,
@@ -57,7 +58,7 @@ from valveflow_ros.report.history import (
     history_sections,
     largest_evidence,
     moment_of,
-    standing,
+    standing_spans,
 )
 from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
@@ -200,7 +201,7 @@ class MonitorResult(Result):
         if judged is None:
             return None
         time_ns, _, evidence = judged
-        return largest_evidence(time_ns, evidence, standing(self.history(), _RESIDUAL))
+        return largest_evidence(time_ns, evidence, standing_spans(self.history(), _RESIDUAL))
 
     @property
     def evidence_words(self) -> str:
@@ -252,7 +253,7 @@ class MonitorResult(Result):
             return []
         time_ns, average_mw, evidence = judged
         figure = evidence_figure(
-            time_ns, average_mw, evidence, standing(self.history(), _RESIDUAL),
+            time_ns, average_mw, evidence, standing_spans(self.history(), _RESIDUAL),
             round(self.settings.real('sample_period') * NS_PER_S),
             self.settings.real('alarm_limit'),
         )  # fmt: skip
@@ -263,12 +264,11 @@ class MonitorResult(Result):
     def _answer(self) -> list[str | Figure]:
         """Return the state at the end, its reasons as far as known, and every diagnosis."""
         alarms, curves = self._alarms_json(), len(self.curves)
-        standing = [a for a in alarms if a['cleared'] is None]
         parts: list[str | Figure] = [
-            notice(f'<b>{text(a["name"].replace("_", " "))}</b>: {text(a["sentence"])}')
-            for a in standing
+            notice(f'<b>{text(name.replace("_", " "))}</b>: {text(sentence)}')
+            for name, sentence in self.standing
         ]
-        if not standing:
+        if not parts:
             gone = f' {counted(len(alarms), "alarm")} came and went.' if alarms else ''
             known = 'No alarm stands at the end.' if curves else 'No new curve was found.'
             parts.append(paragraph(known + gone, '' if gone or not curves else 'good'))
@@ -283,6 +283,21 @@ class MonitorResult(Result):
         ]
         body = table(['data up to', 'verdict', 'what it said'], rows, sentences=True)
         return [*parts, folded(counted(len(rows), 'diagnosis', 'diagnoses'), body)]
+
+    @property
+    def standing(self) -> list[tuple[str, str]]:
+        """Return the name of each alarm that stands at the end, and a sentence on it."""
+        ended = [e.content for e in self.events if isinstance(e, Diagnosed) and e.content]
+        found_ns = onset_ns(ended[-1]) if ended else None
+        told = []
+        for alarm in self._alarms_json():
+            if alarm['cleared'] is None:
+                name, sentence = alarm['name'], alarm['sentence']
+                # The curve alone often cannot tell when it moved.
+                if name == ShiftAlarm.NAME and found_ns and found_ns <= alarm['raised']:
+                    sentence += f' The diagnosis dates it to about {minute(found_ns)}.'
+                told.append((name, sentence))
+        return told
 
     @property
     def named(self) -> list[str]:

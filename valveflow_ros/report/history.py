@@ -256,7 +256,7 @@ def spans(history: History) -> list[tuple[str, AlarmState, int, int, str]]:
     return found
 
 
-def standing(history: History, name: str = '') -> list[tuple[int, int]]:
+def standing_spans(history: History, name: str = '') -> list[tuple[int, int]]:
     """Return begin and end of every interval in which the condition held, of one alarm or all."""
     stands = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
     return sorted(
@@ -266,7 +266,7 @@ def standing(history: History, name: str = '') -> list[tuple[int, int]]:
 
 def standing_s(history: History) -> float:
     """Return the total time in which the condition of any alarm held, in s."""
-    held = standing(history)
+    held = standing_spans(history)
     total, until = 0, -(1 << 62)
     for begin, end in held:
         total += max(0, end - max(begin, until))

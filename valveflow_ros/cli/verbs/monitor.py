@@ -99,7 +99,7 @@ def _text(found: MonitorResult) -> str:
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
         columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
-        *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
+        *(sentence for _, sentence in found.standing),
         found.evidence_words,
         columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
         *found.named,
