@@ -23,7 +23,9 @@ from streams import (
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError, TooFewSamplesError
+from valveflow_ros.fit import fit as fitting
 from valveflow_ros.fit.fit import fit, outline
+from valveflow_ros.fit.result import residual_statistics
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
@@ -281,6 +283,21 @@ def test_a_window_too_short_for_dynamics_keeps_the_static_curve_and_says_so():
     usable(c)
     assert c.dynamics == ()
     assert any('not refined' in note for note in c.notes)
+
+
+@needs_jit
+@pytest.mark.parametrize(('rows', 'settings', 'times'), [
+    (7200, REFINED, 0), (2400, REFINED, 1), (2400, STATIC, 1),
+])  # fmt: skip
+def test_the_static_residuals_are_judged_only_if_the_static_curve_is_the_result(
+    rows, settings, times, monkeypatch
+):
+    judged = []
+    monkeypatch.setattr(
+        fitting, 'residual_statistics', lambda *a: judged.append(a) or residual_statistics(*a)
+    )
+    usable(fit(task(window(2, n=rows, time_constant=4.0), settings)))
+    assert len(judged) == times
 
 
 def broken_up(contents, run):

@@ -16,6 +16,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit import problem as module
 from valveflow_ros.fit import whitening
 from valveflow_ros.fit.problem import Problem, Samples
+from valveflow_ros.fit.uncertainty import covariance_of
 from valveflow_ros.fit.whitening import normal_equations
 
 seeds = st.integers(0, 2**32 - 1)
@@ -229,3 +230,29 @@ def test_where_no_mean_counts_nothing_is_scored(n, usable, means):
     assert jacobian.shape == (means, 4)
     assert residual.tolist() == weight.tolist() == [0.0] * means
     assert problem.cost(model, np.zeros(4)) == 0.0
+
+
+def test_a_gain_answers_each_model_once_and_is_that_of_the_innovations(monkeypatch):
+    samples, model = plant(np.random.default_rng(3))
+    problem = Problem(samples)
+    small = replace(model, levels=np.empty(0), time_constants=np.ones(1), delays=np.zeros(1))
+    costs = []
+    for one in (small, model):
+        e = whitening.whitened(*problem.answer(one), AR)
+        costs.append(float((e * e).sum()))
+    answered, answer = [], Problem.answer
+    monkeypatch.setattr(Problem, 'answer', lambda self, m: answered.append(m) or answer(self, m))
+    expected = 0.5 * len(e) * np.log(costs[0] / costs[1])
+    assert problem.gain(small, model, AR) == pytest.approx(expected, rel=1e-9)
+    assert len(answered) == 2
+
+
+def test_the_error_of_the_prediction_is_that_of_the_final_fit_only():
+    samples, model = plant(np.random.default_rng(3))
+    free = module.free_parameters(model)
+    errors = [
+        covariance_of(Problem(samples), model, free, AR, final=final).prediction_mw
+        for final in (True, False)
+    ]
+    assert errors[0] > 0.0
+    assert np.isnan(errors[1])

@@ -151,7 +151,7 @@ def test_normal_equations_are_the_products_of_whitened_columns(seed, rows, colum
     assert sums == pytest.approx(both.T @ both, abs=1e-9)
     assert scores.shape == (blocks, columns)
     assert scores.sum(axis=0) == pytest.approx(sums[:-1, -1], abs=1e-9)
-    assert square_sum(residual, weight, ar) == pytest.approx(sums[-1, -1], abs=1e-9)
+    assert square_sum(residual, weight, ar) == pytest.approx((sums[-1, -1], count), abs=1e-9)
 
 
 def test_a_block_of_scores_holds_the_rows_of_its_time():

@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,9 +17,11 @@ from extended_file import write_extended
 from streams import needs_jit
 
 import valveflow_ros as vf
+from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
 from valveflow_ros.logs import write_samples, write_table
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.report.words import moment, percent
 
 QUICK = {'refine': False, 'selection_rule': 'paper'}
 HEAVY = {'numpy', 'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'yaml'}
@@ -273,9 +276,34 @@ def test_a_diagnosis_names_extends_and_writes(tmp_path):
 class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
-    def told(cls):
+    def heard(cls):
+        class Heard(vf.Progress):
+            def __init__(self):
+                self.told = []
+
+            def __call__(self, share, what):
+                self.told.append((share, what))
+
+        return Heard()
+
+    @pytest.fixture(scope='class')
+    @classmethod
+    def told(cls, heard):
         faulty = vf.simulate(1.2, 5, effects=['gain_step:g=-0.05,t0_days=0.8']).log
-        return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40})
+        return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40}, progress=heard)
+
+    def test_progress_follows_the_rows_and_names_each_fit_and_diagnosis(self, told, heard):
+        shares = [share for share, _ in heard.told]
+        assert shares == sorted(shares)
+        assert max(np.diff(shares)) < 0.3
+        assert shares[-1] == pytest.approx(0.95)
+        words = [what for _, what in heard.told]
+        (at, _), first = told.diagnoses[0], told.curves[0][0]
+        assert f'diagnosis 1, data up to {minute(at)}' in words
+        fits = [what for what in words if what.startswith('fit ')]
+        assert len(fits) >= len(told.curves)
+        assert f'data up to {minute(first)}' in ' '.join(fits)
+        assert words[-1].startswith('monitoring, data up to ')
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()
@@ -302,7 +330,10 @@ class TestMonitor:
     def test_report_and_picture(self, told, tmp_path):
         assert set(told.write(tmp_path).files) == {'monitor.json', 'report.html'}
         page = (tmp_path / 'report.html').read_text()
-        parts = ['The answer', 'How the curve moved', 'What the monitor said']
+        parts = [
+            'The answer', 'How near the residual came to an alarm', 'How the curve moved',
+            'What the monitor said',
+        ]  # fmt: skip
         places = [page.index(f'<h2>{part}</h2>') for part in parts]
         assert places == sorted(places)
         # What stands at the end and the named cause come before any picture.
@@ -316,6 +347,25 @@ class TestMonitor:
         model_id = told.to_json()['reference']['model_id']
         assert f'is curve {model_id}, from data of 20' in told.reference_words
         assert len(told.plot('alarms').data) > 0
+
+    def test_how_near_an_alarm_was_is_told_without_the_alarm_itself(self, told):
+        rows, (alarm, *_) = told.predictions(), told.to_json()['alarms']
+        assert (alarm['name'], alarm['cleared']) == ('residual', None)
+        at, share = told.largest_evidence
+        assert told.to_json()['largest_evidence'] == {'time': at, 'share': share}
+        evidence = np.abs(rows['evidence'])
+        assert evidence[np.flatnonzero(rows['time_ns'] == at)[0]] == share
+        assert at < alarm['raised']
+        assert 0.0 < share < 1.0 < np.nanmax(evidence)
+        words = told.evidence_words
+        assert f'at most {percent(share)} of its limit, at {moment(at)}.' in words
+        page = told.page().to_html()
+        assert words in page
+        # Evidence that did not last has its own sentence.
+        early = [e for e in told.events if getattr(e, 'name', '') != 'residual']
+        without = replace(told, events=tuple(early))
+        assert without.largest_evidence[1] > 1.0
+        assert 'but not for alarm_on_delay (15 min).' in without.evidence_words
 
     def test_it_says_what_the_engine_fed_in_one_go_says(self, log):
         from valveflow_ros.interface.observation import settings_for

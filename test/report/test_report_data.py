@@ -16,10 +16,10 @@ from valveflow_ros.records import Signal
 from valveflow_ros.report.curve import curve_figure, density
 from valveflow_ros.report.data import (
     coverage_figure,
-    envelope,
     presence_figure,
     segment_path,
 )
+from valveflow_ros.report.figure import envelope
 
 VALUES = hnp.arrays(
     np.float64, st.integers(1, 300), elements=st.floats(-1e6, 1e6) | st.just(np.nan)

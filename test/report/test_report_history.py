@@ -15,8 +15,16 @@ from hypothesis import strategies as st
 from report_stories import HOUR_NS, KNOTS, START_NS, STEP_MW, history
 
 from valveflow_ros.monitoring.alarm_state import AlarmState
-from valveflow_ros.report.figure import Figure
-from valveflow_ros.report.history import AlarmMoment, History, history_of, history_sections
+from valveflow_ros.report.drawing import figure_files
+from valveflow_ros.report.figure import Figure, numbers
+from valveflow_ros.report.history import (
+    AlarmMoment,
+    History,
+    evidence_figure,
+    history_of,
+    history_sections,
+    largest_evidence,
+)
 
 # The states that have a bar, as the picture names them; in the first two the condition stands.
 BARS = {
@@ -167,3 +175,50 @@ def test_every_moment_has_one_state_for_each_alarm(changes):
     days += f'{hours % 24} h' * (hours % 24 > 0)
     said = f'Some alarm stood for {days} in all.' if hours else 'No alarm ever stood.'
     assert said in words_of(told)
+
+
+def test_the_evidence_that_belongs_to_an_alarm_is_no_nearness():
+    # Calm, a rise without an alarm, calm, the rise to an alarm, the alarm, its fall, calm.
+    evidence = np.array([0.1, -0.6, 0.1, 0.7, 1.2, 1.25, 0.8, np.nan, 0.3, 0.1, 0.4])
+    time_ns = START_NS + HOUR_NS * np.arange(len(evidence))
+    alarm = [(int(time_ns[5]), int(time_ns[6]))]
+    assert largest_evidence(time_ns, evidence, alarm) == (int(time_ns[1]), 0.6)
+    assert largest_evidence(time_ns, evidence, []) == (int(time_ns[5]), 1.25)
+    assert largest_evidence(time_ns[5:7], evidence[5:7], alarm) is None
+    assert largest_evidence(time_ns, np.full(len(evidence), np.nan), alarm) is None
+
+
+def test_the_picture_of_the_evidence_is_thin_and_keeps_every_peak():
+    n = 86_400
+    time_ns = START_NS + np.arange(n) * (HOUR_NS // 3600)
+    average, evidence = np.zeros(n), np.zeros(n)
+    average[40_000], average[50_000] = 7.0, -3.0
+    evidence[40_000], evidence[50_000] = 3.0, -0.9
+    evidence[60_000:70_000] = np.nan
+    alarm = [(int(time_ns[70_000]), int(time_ns[80_000]))]
+    figure = evidence_figure(time_ns, average, evidence, alarm, HOUR_NS // 3600, limit_mw=5.0)
+    residual, share, fixed, limit = figure.traces
+    for trace, low, high in ((residual, -3.0, 7.0), (share, -90.0, 125.0)):
+        y, at_ns = numbers(trace, 'y'), numbers(trace, 'x') * 1e6
+        assert len(y) <= 2000
+        assert (np.nanmin(y), np.nanmax(y)) == (low, high)
+        assert at_ns[np.nanargmax(y)] == pytest.approx(time_ns[40_000], abs=HOUR_NS / 20)
+        assert at_ns[np.nanargmin(y)] == pytest.approx(time_ns[50_000], abs=HOUR_NS / 20)
+    assert np.isnan(numbers(share, 'y')).sum() == pytest.approx(2000 * 10_000 / n, abs=4)
+    assert [sorted({*numbers(t, 'y')[[0, 1, 3, 4]]}) for t in (fixed, limit)] == [
+        [-5.0, 5.0], [-100.0, 100.0],
+    ]  # fmt: skip
+    (stripe,) = figure.layout['shapes']
+    assert (stripe['x0'] * 1e6, stripe['x1'] * 1e6) == alarm[0]
+    # Without a fixed limit there is no line in MW.
+    free = evidence_figure(time_ns, average, evidence, alarm, HOUR_NS // 3600)
+    assert [t['yaxis'] for t in free.traces] == ['y', 'y2', 'y2']
+
+
+def test_the_picture_of_the_evidence_becomes_a_file():
+    pytest.importorskip('matplotlib')
+    time_ns = START_NS + HOUR_NS * np.arange(24)
+    values = np.linspace(-1.0, 1.0, 24)
+    alarm = [(int(time_ns[3]), int(time_ns[5]))]
+    files = figure_files(evidence_figure(time_ns, values, values, alarm, HOUR_NS, 2.0))
+    assert files['evidence.png'].startswith(b'\x89PNG')

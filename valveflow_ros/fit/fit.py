@@ -78,9 +78,14 @@ class _Formed:
         return self.scales(rows) * evaluate(pieces, self.contents.u[rows]) + self.offset_mw
 
 
+# The residuals of the static curve are computed only if it is the result: that takes as long as a
+# tenth of a fit.
+_UNJUDGED = ResidualStatistics(math.nan, math.nan, math.nan, math.nan, math.nan)
+
+
 @dataclass(frozen=True, slots=True)
 class _Begun:
-    """The exact partition of the special segments, and its static curve."""
+    """The exact partition of the special segments, and its static curve without residuals."""
 
     formed: _Formed
     static: Characteristic
@@ -98,7 +103,7 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     """
     begun = _begin(task, progress)
     task = begun.formed.task
-    found = _refined(begun, progress) if task.settings.flag('refine') else begun.static
+    found = _refined(begun, progress) if task.settings.flag('refine') else _judged(begun)
     found = with_support(found, task.contents, task.input_noise)
     return found.measured_in(task.settings.output_unit)
 
@@ -168,7 +173,7 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
         breakpoint_intervals=_no_intervals(chosen),
         choice=choice,
         source=_source(task, rows),
-        residuals=_static_residuals(formed, chosen),
+        residuals=_UNJUDGED,
         partition_pieces=chosen,
         held=task.held,
         axis=formed.form.axis,
@@ -314,6 +319,12 @@ def _static_residuals(formed: _Formed, pieces: tuple[Piece, ...]) -> ResidualSta
     return residual_statistics(
         task, rest, weight, task.settings.real('sample_period'), sd, sd / math.sqrt(len(rows))
     )
+
+
+def _judged(begun: _Begun) -> Characteristic:
+    """Return the static curve with its residuals."""
+    static = begun.static
+    return replace(static, residuals=_static_residuals(begun.formed, static.pieces))
 
 
 def _only_straight(begun: _Begun, why: str) -> Characteristic:

@@ -425,13 +425,13 @@ def _whole_before(weight: ByteArray, first: int, order: int) -> int:
 
 
 @kernel
-def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float:
-    """Return the sum of squared innovations of ``residual`` (m,) under ``ar`` (k,)."""
+def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> tuple[float, int]:
+    """Return the sum of squared innovations of ``residual`` (m,), and their number; ar is (k,)."""
     order, end = ar.size, residual.size
     run = _whole_before(weight, min(order, end), order)
     out = np.empty(_NORMAL_BLOCK)
     # Four independent sums, so that no addition waits for the previous one.
-    sums = np.zeros(4)
+    sums, rows = np.zeros(4), 0
     for t in range(order, end, _NORMAL_BLOCK):
         n = min(_NORMAL_BLOCK, end - t)
         _innovations(residual, t, n, 1, ar, out)
@@ -439,7 +439,8 @@ def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> float
             run = run + 1 if weight[t + i] else 0
             if run > order:
                 sums[i % 4] += out[i] * out[i]
-    return float((sums[0] + sums[1]) + (sums[2] + sums[3]))
+                rows += 1
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]), rows
 
 
 @inlined

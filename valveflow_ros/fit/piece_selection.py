@@ -126,15 +126,6 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
     return float(places[best]), float(gain[best])
 
 
-def _gain(problem: Problem, small: RegionalModel, large: RegionalModel, ar: FloatArray) -> float:
-    """Return the log-likelihood gain of ``large`` over ``small``."""
-    residual, weight = problem.answer(large)
-    count = len(whitened(residual, weight, ar))
-    return float(
-        0.5 * count * np.log(problem.cost(small, ar) / max(problem.cost(large, ar), 1e-300))
-    )
-
-
 def choose_pieces(
     problem: Problem, model: RegionalModel, ar: FloatArray, most: int
 ) -> ChosenPieces:
@@ -172,7 +163,7 @@ def _grown(
             break
         trial = _insert(model, place)
         trial, _ = move(problem, trial, ar, free_parameters(trial), 8)
-        worth[model.pieces + 1] = gain = min(gain, _gain(problem, model, trial, ar))
+        worth[model.pieces + 1] = gain = min(gain, problem.gain(model, trial, ar))
         if gain < KNEE_GAIN:
             break
         model = trial
@@ -188,7 +179,7 @@ def _pruned(
         weakest = int(np.argmin(certainty))
         trial = _remove(model, weakest)
         trial, _ = move(problem, trial, ar, free_parameters(trial), 8)
-        least = min(float(certainty[weakest]), _gain(problem, trial, model, ar))
+        least = min(float(certainty[weakest]), problem.gain(trial, model, ar))
         # With J pieces each breakpoint gained at least this: removing more of them costs more.
         others = np.sort(np.delete(certainty, weakest))
         for j, value in enumerate([least, *others.tolist()]):
@@ -209,7 +200,7 @@ def _split(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[Regi
     for place in 0.5 * (model.knots[:-1] + model.knots[1:]):
         trial = _insert(model, float(place))
         trial, _ = move(problem, trial, ar, free_parameters(trial), 12)
-        gain = _gain(problem, model, trial, ar)
+        gain = problem.gain(model, trial, ar)
         if gain > most:
             best, most = trial, gain
     if most >= KNEE_GAIN:

@@ -198,8 +198,18 @@ class Problem:
 
     def cost(self, model: RegionalModel, ar: FloatArray) -> float:
         """Return the sum of squared innovations."""
+        return self._scored(model, ar)[0]
+
+    def gain(self, small: RegionalModel, large: RegionalModel, ar: FloatArray) -> float:
+        """Return the log-likelihood gain of ``large`` over ``small``."""
+        cost, rows = self._scored(large, ar)
+        return float(0.5 * rows * np.log(self.cost(small, ar) / max(cost, 1e-300)))
+
+    def _scored(self, model: RegionalModel, ar: FloatArray) -> tuple[float, int]:
+        """Return the sum of squared innovations and their number."""
         residual, weight = self.answer(model)
-        return float(square_sum(residual, weight, ar))
+        cost, rows = square_sum(residual, weight, ar)
+        return float(cost), int(rows)
 
     def _stretches(
         self, model: RegionalModel, also: int = 0, least: int = 0

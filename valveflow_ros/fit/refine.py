@@ -36,7 +36,7 @@ from valveflow_ros.fit.problem import (
     search_levels,
 )
 from valveflow_ros.fit.uncertainty import covariance_of
-from valveflow_ros.fit.whitening import ORDER, fit_ar, whitened
+from valveflow_ros.fit.whitening import ORDER, fit_ar
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
 from valveflow_ros.signals.static_form import EXPONENTS
 
@@ -216,10 +216,7 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
         trial, _, ar = _settle_down(problem, candidate, free, rounds=3)
         if best is not None:
             # Both are compared with the whitening of the larger model.
-            small, large = problem.cost(best[0], ar), problem.cost(trial, ar)
-            residual, weight = problem.answer(trial)
-            count = len(whitened(residual, weight, ar))
-            if 0.5 * count * np.log(small / max(large, 1e-300)) < _REGION_GAIN:
+            if problem.gain(best[0], trial, ar) < _REGION_GAIN:
                 break
             if _thinnest(problem, trial) < _LEAST_CELLS / _CELLS:
                 break

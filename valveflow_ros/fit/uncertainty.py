@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,7 @@ class Certainty:
         sd of the whitened residual.
     prediction_mw : float
         Error of the prediction due to the errors of the parameters: root mean square of all rows.
+        NaN if the fit is not the final one.
     """
 
     covariance: FloatArray
@@ -87,11 +89,12 @@ def covariance_of(
     covariance[np.ix_(moved, moved)] = plain * np.outer(widen, widen)
     dead = np.flatnonzero(free & ~moved)
     covariance[dead, dead] = np.nan
+    known = np.where(np.outer(moved, moved), covariance, 0.0)
     return Certainty(
         covariance[:packed, :packed],
         np.sqrt(np.diag(covariance)[packed:]),
         float(np.sqrt(max(variance, 0.0))),
-        _prediction_error(jacobian, weight, np.where(np.outer(moved, moved), covariance, 0.0)),
+        _prediction_error(jacobian, weight, known) if final else math.nan,
     )
 
 

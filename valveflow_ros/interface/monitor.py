@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,21 @@ import numpy as np
 
 from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.shift import minute
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import Result
-from valveflow_ros.interface.logs import as_log
+from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
 from valveflow_ros.monitoring.alarm_state import AlarmChange, AlarmState
+from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
+from valveflow_ros.monitoring.diagnosis_requests import onset_ns
 from valveflow_ros.monitoring.events import (
     CurveAdopted,
     Diagnosed,
@@ -40,7 +44,7 @@ from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import Wear
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import FloatArray, IntArray, SampleTable
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import (
     AlarmMoment,
@@ -49,17 +53,29 @@ from valveflow_ros.report.history import (
     History,
     Moment,
     alarms_of,
+    evidence_figure,
     history_of,
     history_sections,
+    largest_evidence,
     moment_of,
+    standing_spans,
 )
 from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
-from valveflow_ros.report.words import VERDICT_WORDS, advice, counted, moment, signed
+from valveflow_ros.report.words import (
+    VERDICT_WORDS,
+    advice,
+    counted,
+    duration,
+    moment,
+    percent,
+    signed,
+)
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 
 # Switches the diagnoses off: each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
+_RESIDUAL = ResidualAlarm.NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,10 +168,57 @@ class MonitorResult(Result):
 
     def predictions(self) -> dict[str, IntArray | FloatArray]:
         """Return the predictions as arrays of shape (rows,), named as in `PredictionBlock`."""
-        blocks = [e for e in self.events if isinstance(e, PredictionBlock)]
         names = ('time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
                  'average_mw', 'evidence', 'shift_mw', 'state')  # fmt: skip
+        return self._predicted(names)
+
+    def _predicted(self, names: Sequence[str]) -> dict[str, Any]:
+        blocks = [e for e in self.events if isinstance(e, PredictionBlock)]
         return {n: np.concatenate([getattr(b, n) for b in blocks]) for n in names if blocks}
+
+    def _judged(self) -> tuple[IntArray, FloatArray, FloatArray] | None:
+        """Return time, mean residual and evidence, NaN where the alarm does not judge.
+
+        The result is in the order of time, and None if nothing was judged.
+        """
+        rows = self._predicted(('time_ns', 'residual_mw', 'average_mw', 'evidence'))
+        if not rows:
+            return None
+        order = np.argsort(rows['time_ns'], kind='stable')  # the clock may have gone back
+        time_ns, residual, average, evidence = (column[order] for column in rows.values())
+        judged = np.isfinite(residual) & np.isfinite(evidence)
+        if not judged.any():
+            return None
+        return time_ns, np.where(judged, average, np.nan), np.where(judged, evidence, np.nan)
+
+    @property
+    def largest_evidence(self) -> tuple[int, float] | None:
+        """Return the time (ns) and the largest evidence of the residual alarm outside alarms.
+
+        The evidence is a share of the limit; None if there were no such rows.
+        """
+        judged = self._judged()
+        if judged is None:
+            return None
+        time_ns, _, evidence = judged
+        return largest_evidence(time_ns, evidence, standing_spans(self.history(), _RESIDUAL))
+
+    @property
+    def evidence_words(self) -> str:
+        """Return a sentence on how near the residual came to an alarm; empty if not judged."""
+        largest = self.largest_evidence
+        if largest is None:
+            return ''
+        at, share = largest
+        delay = duration(self.settings.real('alarm_on_delay'))
+        short = (
+            f' It was beyond the limit, but not for alarm_on_delay ({delay}).'
+            if share > 1.0 else ''
+        )  # fmt: skip
+        return (
+            f'Outside alarms, the evidence of the residual alarm reached at most '
+            f'{percent(share)} of its limit, at {moment(at)}.{short}'
+        )
 
     def history(self) -> History:
         """Return curves, alarms and diagnoses as the reports show them."""
@@ -175,27 +238,43 @@ class MonitorResult(Result):
         lead = paragraph(text(self.source), 'where')
         lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
         lead += paragraph(text(f'{self.reference_words} {self.wear_words}'), 'where')
-        sections = [Section('The answer', self._answer()), *history_sections(self.history())]
+        sections = [Section('The answer', self._answer()), *self._nearness()]
+        sections += history_sections(self.history())
         foot = (
             f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
             'monitor.json beside this page.'
         )
         return Page('What the monitor would have told', lead, sections, foot, self.verb)
 
+    def _nearness(self) -> list[Section]:
+        """Return the section on how near the residual came to an alarm; none if not judged."""
+        judged = self._judged()
+        if judged is None:
+            return []
+        time_ns, average_mw, evidence = judged
+        figure = evidence_figure(
+            time_ns, average_mw, evidence, standing_spans(self.history(), _RESIDUAL),
+            round(self.settings.real('sample_period') * NS_PER_S),
+            self.settings.real('alarm_limit'),
+        )  # fmt: skip
+        words = self.evidence_words
+        parts: list[str | Figure] = [paragraph(words)] if words else []
+        return [Section('How near the residual came to an alarm', [*parts, figure])]
+
     def _answer(self) -> list[str | Figure]:
         """Return the state at the end, its reasons as far as known, and every diagnosis."""
         alarms, curves = self._alarms_json(), len(self.curves)
-        standing = [a for a in alarms if a['cleared'] is None]
         parts: list[str | Figure] = [
-            notice(f'<b>{text(a["name"].replace("_", " "))}</b>: {text(a["sentence"])}')
-            for a in standing
+            notice(f'<b>{text(name.replace("_", " "))}</b>: {text(sentence)}')
+            for name, sentence in self.standing
         ]
-        if not standing:
+        if not parts:
             gone = f' {counted(len(alarms), "alarm")} came and went.' if alarms else ''
             known = 'No alarm stands at the end.' if curves else 'No new curve was found.'
             parts.append(paragraph(known + gone, '' if gone or not curves else 'good'))
         if not self.diagnoses:
             return parts
+        parts += [paragraph(text(told)) for told in self.named]
         parts.append(paragraph(f'The last diagnosis: {text(self.diagnoses[-1][1]["sentence"])}'))
         parts += [paragraph(text(told)) for told in self.advice]
         rows = [
@@ -206,6 +285,36 @@ class MonitorResult(Result):
         return [*parts, folded(counted(len(rows), 'diagnosis', 'diagnoses'), body)]
 
     @property
+    def standing(self) -> list[tuple[str, str]]:
+        """Return the name of each alarm that stands at the end, and a sentence on it."""
+        ended = [e.content for e in self.events if isinstance(e, Diagnosed) and e.content]
+        found_ns = onset_ns(ended[-1]) if ended else None
+        told = []
+        for alarm in self._alarms_json():
+            if alarm['cleared'] is None:
+                name, sentence = alarm['name'], alarm['sentence']
+                # The curve alone often cannot tell when it moved.
+                if name == ShiftAlarm.NAME and found_ns and found_ns <= alarm['raised']:
+                    sentence += f' The diagnosis dates it to about {minute(found_ns)}.'
+                told.append((name, sentence))
+        return told
+
+    @property
+    def named(self) -> list[str]:
+        """Return a sentence on each cause that any diagnosis named: how often, and first when."""
+        times: dict[str, list[int]] = {}
+        for at, d in self.diagnoses:
+            for cause in d['causes']:
+                times.setdefault(cause['name'], []).append(at)
+        total = counted(len(self.diagnoses), 'diagnosis', 'diagnoses')
+        return [
+            f'{name} was named by {len(found)} of {total}, first with data up to '
+            f'{moment(found[0])}.'
+            + ('' if found[-1] == self.diagnoses[-1][0] else ' The last one does not name it.')
+            for name, found in times.items()
+        ]
+
+    @property
     def advice(self) -> list[str]:
         """Return each named cause's effect in MW and its advice, from the latest diagnosis."""
         named = {c['name']: c for _, d in self.diagnoses for c in d['causes']}
@@ -213,11 +322,21 @@ class MonitorResult(Result):
         return [words for words in told if words]
 
     def texts(self) -> dict[str, str]:
-        """Return ``monitor.json``; times are ns since 1970."""
+        """Return ``monitor.json``; times are ns since 1970.
+
+        ``largest_evidence`` is that of the residual alarm outside alarms, as a share of its limit.
+        """
+        largest = self.largest_evidence
         content = {
             'format': 'valveflow/monitor',
             'version': 1,
             'alarms': self._alarms_json(),
+            'largest_evidence': None
+            if largest is None
+            else {
+                'time': largest[0],
+                'share': largest[1],
+            },
             'curves': [
                 {
                     'adopted': at,
@@ -324,15 +443,34 @@ def monitor(
     aligner, engine = Aligner(settings), Monitor(settings, corrector)
     events: list[Event] = [] if reference is None else engine.set_reference(reference)
     tables: list[SampleTable] = []
-    for aligned in aligned_blocks(aligner, log.readings, progress, 'monitoring'):
+    tell = _progress_by_time(log, progress)
+    for aligned in aligned_blocks(aligner, log.readings, None, ''):
         tables.append(aligned.table)
-        events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text)
+        events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text, tell)
+        if len(aligned.table):
+            tell(int(aligned.table.time_ns[-1]), '')
     table = SampleTable.concatenate(tables)
     check_signals(table, aligner.counts())
     times = table.time_ns
     return MonitorResult(
         log.name, tuple(events), int(times[0]), int(times[-1]), settings, engine.reference.wear
     )
+
+
+def _progress_by_time(log: Log, progress: Progress) -> Callable[[int, str], None]:
+    """Return a function that reports how far the rows are, and the fit or diagnosis computed."""
+    times = log.readings.time_ns
+    # Single readings may have a wrong time.
+    first, last = np.quantile(times, (0.01, 0.99)) if len(times) else (0.0, 0.0)
+    begun: Counter[str] = Counter()
+
+    def tell(time_ns: int, what: str) -> None:
+        begun[what] += 1
+        name = f'{what} {begun[what]}' if what else 'monitoring'
+        share = min(max((time_ns - first) / max(last - first, 1.0), 0.0), 1.0)
+        progress(0.1 + 0.85 * share, f'{name}, data up to {minute(time_ns)}')
+
+    return tell
 
 
 def _curve_moment(time_ns: int, c: Characteristic) -> CurveMoment:

@@ -42,7 +42,7 @@ _LIMIT = 1.0
 ) = range(10)  # fmt: skip
 _PLACES = 10
 # The onset is the last time when the evidence was below this fraction of the limit.
-_CALM = 0.25
+CALM = 0.25
 # Suppression ends after at most this many blocks that can be judged.
 _BLOCKS_TO_SEE = 5.0
 # An alarm within this many return delays after the last return continues the earlier one; its
@@ -149,7 +149,7 @@ def _watch(
         v = abs(value[t])
         judged = not math.isnan(v)
         turned = False
-        if judged and v < _CALM * limit:
+        if judged and v < CALM * limit:
             memory[_CALM_NS] = time_ns[t]
         if judged and memory[_ACTIVE] == 0:
             turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)

@@ -176,7 +176,7 @@ class DiagnosisRequests:
         task = self._settle(request_ns)
         if task is None:
             return []
-        self.last, self._onset_ns = Diagnosed(task, content, ''), _onset_ns(content)
+        self.last, self._onset_ns = Diagnosed(task, content, ''), onset_ns(content)
         mark = hashlib.sha256(content.encode()).hexdigest()[:12]
         kind, model_id = JournalKind.DIAGNOSED, task.curve.model_id
         return [self.last, self._journal(kind, request_ns, model_id, mark)]
@@ -214,7 +214,7 @@ class DiagnosisRequests:
         self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
         last, pending = perhaps(saved, 'last', list), perhaps(saved, 'pending', dict)
         self.last = None if last is None else Diagnosed(self._task(last[0]), last[1], last[2])
-        self._onset_ns = None if last is None or not last[1] else _onset_ns(last[1])
+        self._onset_ns = None if last is None or not last[1] else onset_ns(last[1])
         self._pending = None if pending is None else self._task(pending)
         self._hour, self._night, self._night_before, self._asked_ns, self._named_ns = (
             perhaps(saved, name, int)
@@ -315,8 +315,8 @@ class DiagnosisRequests:
         return task
 
 
-def _onset_ns(content: str) -> int | None:
-    """Return the earliest onset of the named causes; None if none has an onset."""
+def onset_ns(content: str) -> int | None:
+    """Return the earliest onset of the causes in `diagnosis.json`; None if none has an onset."""
     try:
         found = [
             e['origin_ns'] + round(e['value'] * _DAY_NS)

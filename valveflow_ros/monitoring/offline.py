@@ -26,12 +26,14 @@ from valveflow_ros.monitoring.monitor import BY_HAND, OF_ITSELF, Monitor
 from valveflow_ros.records import Readings, SampleTable
 from valveflow_ros.signals.align import Aligned, Aligner
 
-Progress = Callable[[float, str], None]
+Diagnose = Callable[[DiagnosisTask], str]
+# Called before a fit or a diagnosis with the time (ns) of the newest row and its name.
+Tell = Callable[[int, str], None]
 _ALARM_ACTIONS = {JournalKind[action.name]: action for action in AlarmAction}
 CLOCK_BACK = 'The clock went back; the rows later than the new time are set aside.'
 
 
-def _quiet(_share: float, _what: str) -> None:
+def _quiet(_time_ns: int, _what: str) -> None:
     """Show no progress."""
 
 
@@ -50,7 +52,7 @@ def align_all(aligner: Aligner, readings: Readings) -> Iterator[Aligned]:
 
 
 def feed_rows(
-    monitor: Monitor, table: SampleTable, diagnose: Callable[[DiagnosisTask], str] | None = None
+    monitor: Monitor, table: SampleTable, diagnose: Diagnose | None = None, tell: Tell = _quiet
 ) -> list[Event]:
     """Feed rows and compute every fit at once; with ``diagnose`` also every diagnosis.
 
@@ -64,9 +66,11 @@ def feed_rows(
         events += fed.events
         for event in fed.events:
             if isinstance(event, FitRequested):
+                tell(event.task.request_ns, 'fit')
                 events += outcome_of(monitor, event.task)
             elif isinstance(event, DiagnosisRequested) and diagnose is not None:
                 request_ns = event.task.request_ns
+                tell(request_ns, 'diagnosis')
                 try:
                     events += monitor.diagnosing.adopt(request_ns, diagnose(event.task))
                 except DataError as error:
@@ -75,16 +79,17 @@ def feed_rows(
 
 
 def feed_aligned(
-    monitor: Monitor, aligned: Aligned, diagnose: Callable[[DiagnosisTask], str] | None = None
+    monitor: Monitor, aligned: Aligned, diagnose: Diagnose | None = None, tell: Tell = _quiet
 ) -> list[Event]:
     """Feed rows that contain restarts of the clock, like `feed_rows`."""
     events: list[Event] = []
     start = 0
     for reset in aligned.resets.tolist():
-        events += feed_rows(monitor, aligned.table.part(start, reset), diagnose)
+        events += feed_rows(monitor, aligned.table.part(start, reset), diagnose, tell)
         events += monitor.restart(CLOCK_BACK)
         start = reset
-    return events + feed_rows(monitor, aligned.table.part(start, len(aligned.table)), diagnose)
+    rest = aligned.table.part(start, len(aligned.table))
+    return events + feed_rows(monitor, rest, diagnose, tell)
 
 
 class JournalReplayer:
@@ -112,7 +117,7 @@ class JournalReplayer:
         self,
         monitor: Monitor,
         journal: Sequence[JournalEntry],
-        diagnose: Callable[[DiagnosisTask], str] | None = None,
+        diagnose: Diagnose | None = None,
         curves: Callable[[str], Characteristic] | None = None,
         left: list[str] | None = None,
         compute: Callable[[FitTask], Characteristic] = fit,

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.records import FloatArray
+from valveflow_ros.records import FloatArray, IntArray
 
 Spec = dict[str, Any]
 DAY_HOUR = '%{x|%d %b %H:%M}<br>'  # the time in the first line of a hover text
@@ -150,6 +150,40 @@ def local_ms(ms: Any, zone: tzinfo) -> Any:
         return None if isinstance(ms, float) else ms
     offset = datetime.fromtimestamp(ms / 1000.0, timezone.utc).astimezone(zone).utcoffset()
     return ms + (offset.total_seconds() * 1000.0 if offset else 0.0)
+
+
+def envelope(
+    time_ns: IntArray, values: FloatArray, stretches: int, period_ns: int
+) -> tuple[int, float, FloatArray]:
+    """Reduce a signal to at most ``2 * stretches`` points, keeping every peak.
+
+    A short signal keeps each of its values at its own grid position.
+
+    Returns
+    -------
+    start_ns, step_ns : int, float
+        Time of the first point and step between points.
+    values : float64 (2 k,)
+        Lowest and highest value of each interval in the order in which they occur; NaN if
+        nothing was measured.
+    """
+    if not len(time_ns):
+        return 0, 1.0, np.empty(0)
+    span = int(time_ns[-1] - time_ns[0]) + period_ns
+    k = max(1, min(stretches, span // (2 * period_ns)))
+    width = span / k
+    place = np.minimum(((time_ns - time_ns[0]) / width).astype(np.int64), k - 1)
+    good = np.isfinite(values)
+    place, value = place[good], values[good]
+    out = np.full((k, 2), np.nan)
+    if len(value):
+        first = np.flatnonzero(np.diff(place, prepend=-1))
+        low = np.minimum.reduceat(value, first)
+        high = np.maximum.reduceat(value, first)
+        rising = value[first] <= value[np.append(first[1:], len(value)) - 1]
+        out[place[first], 0] = np.where(rising, low, high)
+        out[place[first], 1] = np.where(rising, high, low)
+    return int(time_ns[0]), width / 2.0, out.ravel()
 
 
 # Traces, axes and marks. Keyword arguments are plotly's and take precedence.

@@ -4,24 +4,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from valveflow_ros.monitoring.alarm_state import AlarmState
-from valveflow_ros.records import FloatArray
+from valveflow_ros.monitoring.alarms import CALM
+from valveflow_ros.records import FloatArray, IntArray
 from valveflow_ros.report.figure import (
     DAY_HOUR,
     Figure,
     Spec,
     axis,
+    envelope,
     error_bars,
     line,
     moments,
     points,
     rounded,
+    stripe,
     time_axis,
     token,
 )
@@ -253,10 +256,17 @@ def spans(history: History) -> list[tuple[str, AlarmState, int, int, str]]:
     return found
 
 
+def standing_spans(history: History, name: str = '') -> list[tuple[int, int]]:
+    """Return begin and end of every interval in which the condition held, of one alarm or all."""
+    stands = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
+    return sorted(
+        (a, b) for n, state, a, b, _ in spans(history) if state in stands and name in ('', n)
+    )
+
+
 def standing_s(history: History) -> float:
     """Return the total time in which the condition of any alarm held, in s."""
-    stands = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
-    held = sorted((a, b) for _, state, a, b, _ in spans(history) if state in stands)
+    held = standing_spans(history)
     total, until = 0, -(1 << 62)
     for begin, end in held:
         total += max(0, end - max(begin, until))
@@ -364,6 +374,112 @@ def alarms_table(history: History) -> str:
     body = table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)
     what = 'The change' if len(shown) == 1 else f'All {changes}'
     return paragraph(told) + folded(f'{what} in words', body)
+
+
+# How near the residual alarm was: its evidence is a share of the limit.
+
+_DRAWN_STRETCHES = 1000
+_DRAWN_SHARE = 1.25  # larger values are drawn at this one: the alarm is raised at 1
+
+
+def largest_evidence(
+    time_ns: IntArray, evidence: FloatArray, alarms: Sequence[tuple[int, int]]
+) -> tuple[int, float] | None:
+    """Return time and size of the largest evidence outside alarms; None if there is none.
+
+    The rise of the evidence before an alarm and its fall afterwards belong to the alarm: all rows
+    between two calm ones.
+
+    Parameters
+    ----------
+    time_ns : int64 (n,)
+    evidence : float64 (n,)
+        NaN where it was not judged.
+    alarms : sequence of (int, int)
+        Begin and end of each.
+    """
+    judged = np.isfinite(evidence)
+    time_ns, size = time_ns[judged], np.abs(evidence[judged])
+    course = np.cumsum(size < CALM)
+    raised = np.zeros(len(size), dtype=bool)
+    for begin, end in alarms:
+        raised |= (time_ns >= begin) & (time_ns <= end)
+    free = np.flatnonzero(~np.isin(course, course[raised]))
+    if not len(free):
+        return None
+    k = free[np.argmax(size[free])]
+    return int(time_ns[k]), float(size[k])
+
+
+def evidence_figure(
+    time_ns: IntArray,
+    average_mw: FloatArray,
+    evidence: FloatArray,
+    alarms: Sequence[tuple[int, int]],
+    period_ns: int,
+    limit_mw: float = 0.0,
+) -> Figure:
+    """Return the mean residual and the evidence of its alarm over time.
+
+    Parameters
+    ----------
+    time_ns : int64 (n,)
+        Rising.
+    average_mw, evidence : float64 (n,)
+        NaN where the residual was not judged.
+    alarms : sequence of (int, int)
+        Begin and end of each.
+    period_ns : int
+        Step of the rows.
+    limit_mw : float
+        Fixed limit of the mean residual; 0 if the evidence is that of the control chart.
+    """
+    shown = 100.0 * np.clip(evidence, -_DRAWN_SHARE, _DRAWN_SHARE)
+    traces = []
+    for values, name, up, hover in (
+        (average_mw, 'mean residual', 'y', '%{y:+.2f} MW'),
+        (shown, 'evidence of the alarm', 'y2', '%{y:+.0f} % of the limit'),
+    ):
+        start_ns, step_ns, ends = envelope(time_ns, values, _DRAWN_STRETCHES, period_ns)
+        at = moments((start_ns + step_ns * np.arange(len(ends))) / 1e6)
+        colour = 'data' if up == 'y' else 'chosen'
+        hover = f'{DAY_HOUR}{hover}<extra></extra>'
+        traces.append(line(at, rounded(ends), name, colour, hover, width=1.2, yaxis=up))
+    first, last = int(time_ns[0]) / 1e6, int(time_ns[-1]) / 1e6
+    across = moments([first, last, np.nan, first, last])
+    for up, limit in (('y', limit_mw), ('y2', 100.0)):
+        if limit > 0.0:
+            traces.append(line(
+                across, [limit, limit, None, -limit, -limit], 'limit', 'steady', width=1.5,
+                dash='dash', yaxis=up, legendgroup='limit', showlegend=up == 'y2',
+            ))  # fmt: skip
+    layout: Spec = {
+        'xaxis': time_axis(anchor='y2', range=moments([first, last])),
+        'yaxis': axis('mean residual<br>(MW)', domain=[0.56, 1.0]),
+        'yaxis2': axis('evidence<br>(% of limit)', domain=[0.0, 0.46], range=[-135, 135]),
+        'showlegend': True,
+        'shapes': [stripe(a / 1e6, b / 1e6, 'notice') for a, b in alarms],
+    }
+    fixed = f', with its fixed limit of {decimals(limit_mw, 2)} MW' if limit_mw > 0.0 else ''
+    rule = (
+        'It is the mean residual divided by its limit.'
+        if limit_mw > 0.0
+        else 'It adds up small lasting differences, so a small one comes near the limit slowly '
+        'and a large one within minutes; there is no fixed limit in MW.'
+    )
+    caption = (
+        '<b>The alarm is raised when the evidence stays beyond 100 % for alarm_on_delay.</b> '
+        f'Above, the running mean of the residual{fixed}. Below, the evidence of the alarm, '
+        f'drawn up to {100 * _DRAWN_SHARE:.0f} %. {rule} On a coloured background the alarm '
+        'stands: it returns after alarm_off_delay at the openings where it was raised. In a gap '
+        'the residual could not be judged.'
+    )
+    words = (
+        f'Mean residual and evidence of the residual alarm over '
+        f'{duration((time_ns[-1] - time_ns[0]) / 1e9)}, with '
+        f'{counted(len(alarms), "interval")} in which the alarm stands.'
+    )
+    return Figure('evidence', caption, words, traces, layout, height=520)
 
 
 # Colour and symbol for each of the fixed inputs, distinguishable without colours.

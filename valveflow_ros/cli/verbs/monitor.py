@@ -99,9 +99,11 @@ def _text(found: MonitorResult) -> str:
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
         columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
-        *(a['sentence'] for a in content['alarms'] if a['cleared'] is None),
+        *(sentence for _, sentence in found.standing),
+        found.evidence_words,
         columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
-        *(d['sentence'] for _, d in found.diagnoses[-1:]),
+        *found.named,
+        *(f'The last diagnosis: {d["sentence"]}' for _, d in found.diagnoses[-1:]),
         *found.advice,
         found.reference_words,
         found.wear_words,
