@@ -728,12 +728,19 @@ def _experiments(causes: tuple[NamedCause, ...]) -> tuple[str, ...]:
     return tuple(c.experiment for c in causes if c.not_told_apart)
 
 
+def _nearly(names: tuple[str, ...]) -> str:
+    """Return a sentence on the causes that cannot be distinguished from a named one."""
+    fit = 'fits' if len(names) == 1 else 'fit'
+    return f' Not certain: {listed(names)} {fit} these data nearly as well.' if names else ''
+
+
 def _sentence(d: Diagnosis) -> str:
     """Return the verdict as sentences for an operator."""
     wander = '' if d.disturbance is None else f' {d.disturbance.sentence}'
     if d.verdict == NAMED:
         drifts = d.disturbance is not None and d.disturbance.drift_mw is not None
-        return ' '.join(c.sentence for c in d.causes) + (wander if drifts else '')
+        told = (c.sentence + _nearly(c.not_told_apart) for c in d.causes)
+        return ' '.join(told) + (wander if drifts else '')
     blind = [name for name, reason in d.rejected if 'cannot be judged' in reason]
     but = f' These causes could not be checked with this record: {listed(blind)}.' if blind else ''
     if d.verdict == NOTHING:

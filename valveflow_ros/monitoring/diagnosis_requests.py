@@ -37,6 +37,7 @@ from valveflow_ros.state import State, perhaps
 ASKED = 'asked for by hand'
 NIGHTLY = 'nightly'
 ALARM = 'the residual alarm was raised'
+MORE_DATA = 'more data since the residual alarm'
 FITS_AGAIN = 'The model fits again.'
 LEAST_S = 86400.0
 _HOUR_NS = 3600 * NS_PER_S
@@ -82,6 +83,7 @@ class DiagnosisRequests:
         self.sentence = ''
         self.last: Diagnosed | None = None
         self._onset_ns: int | None = None
+        self._unsure = False  # the last diagnosis named no cause, or not one alone
         # `curve.model` creates a new object at each access, and rows arrive one by one.
         self._model: tuple[Characteristic, RegionalModel] | None = None
         self._hour: int | None = None
@@ -149,6 +151,8 @@ class DiagnosisRequests:
         tonight = another and self.settings.whole('diagnosis_hour') >= 0
         self._night = night
         reason = self._wanted or (NIGHTLY if tonight else '')
+        if not reason and self._unsure and self._young(time_ns):
+            reason = MORE_DATA
         if (
             reason and self._may_ask(time_ns)
             and not self._objection(time_ns, window, curve, since_ns)
@@ -177,6 +181,7 @@ class DiagnosisRequests:
         if task is None:
             return []
         self.last, self._onset_ns = Diagnosed(task, content, ''), onset_ns(content)
+        self._unsure = _is_unsure(content)
         mark = hashlib.sha256(content.encode()).hexdigest()[:12]
         kind, model_id = JournalKind.DIAGNOSED, task.curve.model_id
         return [self.last, self._journal(kind, request_ns, model_id, mark)]
@@ -214,7 +219,9 @@ class DiagnosisRequests:
         self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
         last, pending = perhaps(saved, 'last', list), perhaps(saved, 'pending', dict)
         self.last = None if last is None else Diagnosed(self._task(last[0]), last[1], last[2])
-        self._onset_ns = None if last is None or not last[1] else onset_ns(last[1])
+        content = '' if last is None else last[1]
+        self._onset_ns = onset_ns(content) if content else None
+        self._unsure = bool(content) and _is_unsure(content)
         self._pending = None if pending is None else self._task(pending)
         self._hour, self._night, self._night_before, self._asked_ns, self._named_ns = (
             perhaps(saved, name, int)
@@ -262,6 +269,11 @@ class DiagnosisRequests:
             self.sentence = ''
             return [self._journal(JournalKind.MISMATCH, 0, '', FITS_AGAIN)]
         return []
+
+    def _young(self, time_ns: int) -> bool:
+        """Return True on the first day of the residual alarm, when every hour adds loads."""
+        wanted = self._alarm.active and self.settings.flag('diagnosis_on_mismatch')
+        return wanted and time_ns - self._alarm.raised_ns < _DAY_NS
 
     def _want(self, reason: str) -> None:
         """Schedule a diagnosis as soon as possible."""
@@ -313,6 +325,15 @@ class DiagnosisRequests:
             return None
         self._pending = None
         return task
+
+
+def _is_unsure(content: str) -> bool:
+    """Return True if a `diagnosis.json` names no cause, or one that others fit nearly as well."""
+    try:
+        found = json.loads(content)
+        return found['verdict'] != 'named' or bool(found['not_told_apart'])
+    except (ValueError, KeyError, TypeError):
+        return False
 
 
 def onset_ns(content: str) -> int | None:

@@ -108,12 +108,9 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     said = text(d.sentence)
     good = d.verdict == NOTHING and not _drifts(d)
     parts: list[str | Figure] = [paragraph(said, 'good') if good else notice(said)]
-    if d.not_told_apart:
-        names = ' and '.join(text(n) for n in d.not_told_apart)
-        doubt = f'These data do not tell apart: {names}.'
-        if d.experiments:
-            doubt += ' What would tell them apart: ' + ' '.join(text(e) for e in d.experiments)
-        parts.append(notice(doubt))
+    if d.experiments:
+        told = ' '.join(text(e) for e in d.experiments)
+        parts.append(notice(f'What would tell them apart: {told}'))
     for c in d.causes:
         if c.to_do:
             known = f': {text(c.meaning)}' if c.meaning else '.'

@@ -113,7 +113,6 @@ def _text(found: DiagnosisResult) -> str:
         f'{found.data.source}: {VERDICT_WORDS[d.verdict]}. {d.sentence}',
         *(advice(c.name, c.meaning, c.to_do) for c in d.causes),
         columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
-        f'Not told apart: {", ".join(d.not_told_apart)}.' if d.not_told_apart else '',
         *(f'What would tell them apart: {e}' for e in d.experiments),
         'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
         f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW, '
