@@ -16,6 +16,7 @@ from streams import needs_jit
 import valveflow_ros as vf
 from benchmarks.naming import __main__ as program
 from benchmarks.naming import answers, records, scoring
+from benchmarks.study import RESULTS
 from valveflow_ros.errors import ValveflowError
 
 SIGNALS = {
@@ -94,6 +95,16 @@ def test_a_truth_that_differs_is_told(
     assert 'differ from the published set' in capsys.readouterr().out
     monkeypatch.setitem(records.SHA256, records.SEALED, records.sha256(tiny))
     assert records.same_as_published(tiny, records.SEALED)
+
+
+def test_the_kept_result_is_of_the_published_set() -> None:
+    kept = json.loads((RESULTS / 'naming.json').read_text())
+    assert kept['published']
+    assert kept['truth_sha256'] == records.SHA256[records.SEALED]
+    truth = {row['record']: row for row in kept['rows']}
+    for method, scored in kept['summary'].items():
+        said = {name: row['answers'][method] for name, row in truth.items()}
+        assert scoring.score(truth, said) == scored
 
 
 TRUTH = {
