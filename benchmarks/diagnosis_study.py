@@ -60,13 +60,19 @@ def watched(log: SimulatedLog, days: float) -> tuple[FitTask, IntArray, Settings
     return task, spans.reshape(-1, 2), settings
 
 
-def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[str, float]]:
-    """Simulate and diagnose one plant."""
+def simulated(case: Case, days: float) -> SimulatedLog:
+    """Simulate one plant, with what is outside the catalogue."""
     log = simulate(days, case.seed, case.unit, effects=case.effects)
     if case.outside_share:
         log = added_to(log, case.label, case.seed, case.outside_share)
     if case.kind == 'slow':
         log = slowly(log, case.label, case.seed)
+    return log
+
+
+def run(case: Case, days: float) -> tuple[Diagnosis, SimulatedLog, Record, dict[str, float]]:
+    """Simulate and diagnose one plant."""
+    log = simulated(case, days)
     begin = time.process_time()
     task, spans, settings = watched(log, days)
     if case.given:

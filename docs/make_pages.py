@@ -31,6 +31,7 @@ PARTS: dict[str, Callable[[], str]] = {
     'measured': page_claims.measured,
     'results': page_claims.results,
     'acts': page_claims.acts,
+    'naming': page_claims.naming,
     'installed': page_claims.installed,
     'diagnostics': page_health.diagnostics,
     'reasons': page_health.reasons,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -246,6 +247,50 @@ def _speed() -> list[tuple[str, str, str]]:
              'with a start of its own',
              f'{info["results"]["info mcap"]["wall_s"]:.1f} s', 'reading'),
     ]  # fmt: skip
+
+
+_NAMING = {
+    'hidden': 'an effect with a name: named, and nothing else',
+    'healthy': 'healthy: nothing named',
+    'outside': 'an effect without a name: said to be there, not named',
+}
+_NAMING_PLANTS = {
+    'paper, 1s': "the paper's plant, every second", 'paper, minute': "the paper's plant, means",
+    'physics, 1s': 'built from physics, every second', 'physics, minute': 'the same, means',
+}  # fmt: skip
+
+
+def naming() -> str:
+    """Return how the methods come out in the benchmark for naming causes."""
+    methods = result('naming')['summary']
+
+    def line(words: str, of: Callable[[dict[str, Any]], str]) -> tuple[str, ...]:
+        return words, *(of(s) for s in methods.values())
+
+    def share(c: dict[str, Any], count: str, of: str) -> str:
+        low, high = (100.0 * end for end in c['interval'])
+        return f'{c[count]} of {c[of]} ({low:.0f} to {high:.0f} %)' if c[of] else 'none given'
+
+    rows = [line(words, lambda s, k=kind: share(s['kinds'][k], 'right', 'records'))
+            for kind, words in _NAMING.items()]  # fmt: skip
+    rows += [
+        *(line(f'{words}: right', lambda s, p=place: share(s['plants'][p], 'right', 'records'))
+          for place, words in _NAMING_PLANTS.items()),
+        line('all: right', lambda s: share(s['all'], 'right', 'records')),
+        *(line(f'all: {words}', lambda s, k=key: str(s['all'][k]))
+          for key, words in (('wrong', 'a wrong name'), ('silent', 'wrongly silent'),
+                             ('unknown', 'wrongly "unknown"'))),
+        *(line(words, lambda s, k=key: share(s[k], 'held', 'given'))
+          for key, words in (('size', 'intervals of sizes that hold the truth'),
+                             ('onset_hours', 'intervals of onsets that do'))),
+        line('error of the onset, median and largest', _onset),
+    ]  # fmt: skip
+    return table(('of the sealed set', *methods), rows)
+
+
+def _onset(scored: dict[str, Any]) -> str:
+    s = scored['onset_hours']
+    return f'{s["median_error"]:.2g} h, {s["largest_error"]:.2g} h' if s['given'] else 'none given'
 
 
 def acts() -> str:
