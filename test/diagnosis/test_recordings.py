@@ -143,3 +143,16 @@ def test_a_lag_that_its_error_exceeds_is_not_told() -> None:
     said = lag.sentence(0, told)
     assert 'a time constant of 30 s and a delay that is not known' in said
     assert 'a delay of 5 s' in lag.sentence(0, None)
+
+
+@pytest.mark.parametrize(
+    ('unit', 'true'),
+    [('choked_fixed:number=5008', {'vacuum'}),
+     ('integrated_input_fixed:number=5012', {'vacuum', 'exponent'})],
+)  # fmt: skip
+def test_the_rounded_curve_of_a_healthy_unit_is_no_cause(unit: str, true: set[str]) -> None:
+    """Its law has another exponent than the paper's, which is true, and it follows the vacuum."""
+    _, number = unit.split('=')
+    log = vf.simulate(5.0, int(number), [], unit=unit, recording='minute')
+    found = vf.diagnose(log.to_dataframe(), covariates={'vacuum': 'condenser_pressure_kpa'})
+    assert {c.name for c in found.diagnosis.causes} <= true

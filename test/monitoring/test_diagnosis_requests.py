@@ -17,6 +17,7 @@ from valveflow_ros.monitoring.diagnosis_requests import (
     ALARM,
     ASKED,
     FITS_AGAIN,
+    MORE_DATA,
     NIGHTLY,
     DiagnosisRequests,
 )
@@ -39,13 +40,15 @@ EMPTY = WindowContents(
 )
 CURVE = SimpleNamespace(model_id='curve', place_words=str)
 CONTENT = json.dumps({'verdict': 'nothing', 'sentence': 'All is well.'})
+SURE = json.dumps({'verdict': 'named', 'sentence': 'It slips.', 'not_told_apart': []})
+UNSURE = json.dumps({'verdict': 'named', 'sentence': 'It slips.', 'not_told_apart': ['clock']})
 
 
 class Screening:
     """A `DiagnosisRequests` with a window, an alarm and a misfit that the test sets."""
 
     def __init__(self, **values):
-        self.alarm = SimpleNamespace(active=False)
+        self.alarm = SimpleNamespace(active=False, raised_ns=MIDNIGHT_NS)
         self.window = SimpleNamespace(span_s=5 * 86400.0, contents=lambda since_ns: EMPTY)
         self.score, self.time_ns, self.curve = 0.0, MIDNIGHT_NS, CURVE
         settings = Settings({'mismatch_limit': 5.0, 'diagnosis_hour': 2, **values})
@@ -78,10 +81,10 @@ def reasons(said):
             if isinstance(e, JournalEntry) and e.kind == JournalKind.DIAGNOSE]  # fmt: skip
 
 
-def settle(bench, said):
+def settle(bench, said, content=CONTENT):
     for event in said:
         if isinstance(event, DiagnosisRequested):
-            bench.made.adopt(event.task.request_ns, CONTENT)
+            bench.made.adopt(event.task.request_ns, content)
     return said
 
 
@@ -133,16 +136,29 @@ def test_the_alarm_asks_once_and_waits_for_the_pause():
     bench = Screening(diagnosis_hour=-1, diagnosis_pause=4.0)
     bench.until(1)
     bench.alarm.active = True
-    assert reasons(settle(bench, bench.until(9))) == [(2 * HOUR_NS, ALARM)]
+    assert reasons(settle(bench, bench.until(9), SURE)) == [(2 * HOUR_NS, ALARM)]
     bench.alarm.active = False
     bench.until(1)
-    settle(bench, bench.made.request(bench.time_ns, bench.window, bench.curve))
+    settle(bench, bench.made.request(bench.time_ns, bench.window, bench.curve), SURE)
     bench.alarm.active = True
     (asked,) = reasons(bench.until(9))
     assert asked == (15 * HOUR_NS, ALARM)
     quiet = Screening(diagnosis_hour=-1, diagnosis_on_mismatch=False)
     quiet.alarm.active = True
     assert not reasons(quiet.until(5))
+
+
+@pytest.mark.parametrize('content', [CONTENT, UNSURE])
+def test_on_the_first_day_of_an_alarm_an_unsure_diagnosis_is_made_again(content):
+    bench = Screening(diagnosis_hour=-1, diagnosis_pause=8.0)
+    bench.alarm.active = True
+    asked = []
+    for _ in range(30):  # hours
+        asked += reasons(settle(bench, bench.until(1), content))
+    assert asked == [(1 * HOUR_NS, ALARM), *((h * HOUR_NS, MORE_DATA) for h in (9, 17))]
+    bench.alarm.raised_ns = bench.time_ns
+    assert len(reasons(settle(bench, bench.until(1), SURE))) == 1
+    assert not reasons(bench.until(20))
 
 
 def test_a_misfit_is_said_once_and_its_end_too():
