@@ -341,12 +341,15 @@ def results() -> str:
         _row('an effect of three times its default size begins on day 10',
              f'an alarm in {found} of {tried} runs; on day 20 it is still active in {stood}',
              list(_MONITOR)[1]),
-        _row('one hidden effect, 2 to 3 times the detection limit, five days',
+        _row("one hidden effect in plants of the paper's kind, 2 to 3 times the detection limit",
              f'named, and no other, in {hidden["right"]} of {hidden["records"]}; another name '
              f'with confidence in {hidden["named_with_confidence_wrongly"]}',
              'diagnosis_hidden_24000_24005_5d'),
-        _row('healthy plants, five days', f'nothing named in {null["right"]} of {null["records"]}',
+        _row("healthy plants of the paper's kind, five days",
+             f'nothing named in {null["right"]} of {null["records"]}',
              'diagnosis_null_17000_17149_5d'),
+        _row('units built from physics, with an effect or healthy: [a benchmark](docs/naming.md)',
+             _on_physics(), 'naming'),
         _row('sticking valves of a refinery, from command and process value (real data)',
              f'{valves["found"] * valves["sticky"]:.0f} of {valves["sticky"]} found, '
              f'{valves["falsely_named"] * valves["sound"]:.0f} of {valves["sound"]} sound ones '
@@ -356,6 +359,14 @@ def results() -> str:
         _killed(),
     ]  # fmt: skip
     return table(('question', 'answer'), [row[:2] for row in rows])
+
+
+def _on_physics() -> str:
+    """Return the outcome of the naming benchmark on units built from physics."""
+    plants = result('naming')['summary']['valveflow']['plants']
+    physics = [of for plant, of in plants.items() if plant.startswith('physics')]
+    right, wrong, all_ = (sum(p[key] for p in physics) for key in ('right', 'wrong', 'records'))
+    return f'right answers in {right} of {all_}, a wrong or further name in {wrong}'
 
 
 def _killed() -> tuple[str, str, str]:
