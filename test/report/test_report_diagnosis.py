@@ -27,7 +27,7 @@ def test_the_answer_names_the_cause_its_rival_and_the_experiment(page):
     d = diagnosis()
     assert page.sections[0].title == 'The answer'
     first = ' '.join(p for p in page.sections[0].parts if isinstance(p, str))
-    for part in (d.sentence, 'do not tell apart: input_step', 'Weigh the coal.'):
+    for part in (d.sentence, 'tell gain_step and input_step apart', 'Weigh the coal.'):
         assert part in first
     for value in (d.rmse_simulation, d.rmse_extended, d.rmse_noise_floor):
         assert decimals(value, 2) in first

@@ -335,8 +335,8 @@ def common_change(
         return 0, 0, 0
     mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
     reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
-    tail = 0.5 * (1.0 - share)
-    offset = np.interp([0.5, tail, 1.0 - tail], reached, (edges - edges[0]).astype(np.float64))
+    side = 0.5 * (1.0 - share)
+    offset = np.interp([0.5, side, 1.0 - side], reached, (edges - edges[0]).astype(np.float64))
     middle, low, high = (int(edges[0]) + int(v) for v in offset)
     return middle, low, high
 

@@ -14,6 +14,7 @@ from valveflow_ros.diagnosis.cause import Estimate, dates, told
 from valveflow_ros.diagnosis.evidence import SegmentGain
 from valveflow_ros.diagnosis.result import NAMED, NOTHING, Diagnosis
 from valveflow_ros.diagnosis.signature import Answer, ResidualMap, Signature
+from valveflow_ros.errors import listed
 from valveflow_ros.records import FloatArray
 from valveflow_ros.report.figure import (
     DAY_HOUR,
@@ -108,9 +109,10 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     said = text(d.sentence)
     good = d.verdict == NOTHING and not _drifts(d)
     parts: list[str | Figure] = [paragraph(said, 'good') if good else notice(said)]
-    if d.experiments:
-        told = ' '.join(text(e) for e in d.experiments)
-        parts.append(notice(f'What would tell them apart: {told}'))
+    for c in d.causes:
+        if c.not_told_apart:
+            names = text(listed((c.name, *c.not_told_apart)))
+            parts.append(notice(f'What would tell {names} apart: {text(c.experiment)}'))
     for c in d.causes:
         if c.to_do:
             known = f': {text(c.meaning)}' if c.meaning else '.'
