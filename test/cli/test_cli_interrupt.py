@@ -133,6 +133,26 @@ def test_what_a_library_has_half_made_is_cleared_away_without_a_word():
     assert (done.returncode, done.stderr) == (130, SAID)
 
 
+def test_ctrl_c_while_the_interpreter_ends_changes_nothing():
+    code = (
+        'import atexit, os, signal, sys\n'
+        'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+        'from valveflow_ros.cli import main\n'
+        'class Last:\n'
+        '    def __del__(self, kill=os.kill, me=os.getpid()):\n'
+        '        kill(me, 2)\n'
+        'sys.last = Last()\n'
+        'atexit.register(os.kill, os.getpid(), signal.SIGINT)\n'
+        'sys.argv[1:] = ["--version"]\n'
+        'sys.exit(main.main())'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.startswith('valveflow ')
+
+
 @pytest.mark.parametrize('seed', range(4))
 def test_ctrl_c_at_any_moment_of_a_real_process(logs, identified, tmp_path, seed):
     """From the first import to the last byte; pressed twice, as people do."""
@@ -144,7 +164,8 @@ def test_ctrl_c_at_any_moment_of_a_real_process(logs, identified, tmp_path, seed
         'from valveflow_ros.cli import main\n'
         'usual = main.load\n'
         'main.load = lambda name: print("begun", flush=True) or usual(name)\n'
-        f'sys.exit(main.main({words!r}))'
+        f'sys.argv[1:] = {words!r}\n'
+        'sys.exit(main.main())'
     )
     done = subprocess.Popen(
         [sys.executable, '-c', code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

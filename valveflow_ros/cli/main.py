@@ -219,8 +219,12 @@ class Stop:
         raise KeyboardInterrupt
 
     @contextmanager
-    def listening(self) -> Iterator[Stop]:
-        """Handle the signals within a block; the earlier handlers are restored after it."""
+    def listening(self, ends_process: bool = False) -> Iterator[Stop]:
+        """Handle the signals within a block; the earlier handlers are restored after it.
+
+        If the process ends after the block, Ctrl-C is ignored from then on: the output is
+        complete, and the interpreter needs a part of a second to end.
+        """
         before: dict[int, object] = {}
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             # Background jobs of a shell ignore Ctrl-C, and nohup ignores a hang-up: keep this.
@@ -232,6 +236,8 @@ class Stop:
             yield self
         finally:
             for taken, handler in before.items():
+                if ends_process and taken == signal.SIGINT:
+                    handler = signal.SIG_IGN
                 signal.signal(taken, handler)  # type: ignore[arg-type]
 
 
@@ -260,7 +266,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Compilation creates millions of permanent objects: garbage collection with the usual
     # frequency takes a tenth of the time of the first run.
     gc.set_threshold(50_000, 20, 50)
-    with Stop().listening() as stop:
+    with Stop().listening(ends_process=arguments is None) as stop:
         return _guarded(words, console, stop)
 
 
