@@ -99,15 +99,14 @@ class Covariate:
     surface: tuple[float, ...]
     course: tuple[float, ...]
 
-    def usual(self, u: FloatArray, pressure: FloatArray) -> FloatArray:
-        """Return the usual covariate at an input and a pressure in MPa, shape (n,)."""
-        return np.asarray(
-            np.polynomial.polynomial.polyval(self.load(u, pressure), np.array(self.course))
-        )
+    def terms(self, u: FloatArray, pressure: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the covariate minus its usual value, L - 1 and its square, shape (3, n).
 
-    def load(self, u: FloatArray, pressure: FloatArray) -> FloatArray:
-        """Return the load relative to ``power_mw`` at an input and a pressure, shape (n,)."""
-        return np.asarray(_powers(u, pressure, self.centre) @ np.array(self.surface))
+        L is the load over ``power_mw`` at an input and a pressure in MPa.
+        """
+        load = _powers(u, pressure, self.centre) @ np.array(self.surface)
+        usual = np.polynomial.polynomial.polyval(load, np.array(self.course))
+        return np.stack([values - usual, load - 1.0, (load - 1.0) ** 2])
 
 
 _CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))
@@ -462,7 +461,7 @@ def _covariate(
         rows.name, rows.column, rows.unit, 0.0, usual_mw, centre, tuple(surface.tolist()),
         tuple(course.tolist()),
     )  # fmt: skip
-    return replace(about, spread=float((c - about.usual(a, b)).std())), values
+    return replace(about, spread=float(about.terms(a, b, c)[0].std())), values
 
 
 def _reference(

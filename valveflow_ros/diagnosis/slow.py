@@ -125,7 +125,7 @@ def half_hours(
 def deviation(grids: Grids, name: str) -> FloatArray:
     """Return covariate minus its usual value at the load, (m,), in its unit."""
     about, here = grids.covariates[name]
-    return grids.means(here - about.usual(grids.u, grids.pressure))
+    return grids.means(about.terms(grids.u, grids.pressure, here)[0])
 
 
 def _hats(x: FloatArray, rows: BoolArray) -> Iterator[FloatArray]:

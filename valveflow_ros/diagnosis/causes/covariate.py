@@ -44,11 +44,11 @@ def covariate_cause(about: Covariate) -> Cause:
 
     def act(values: Values, grids: Grids, extra: Values) -> FloatArray:
         del extra
-        _, here = grids.covariates[name]
-        load = about.load(grids.u, grids.pressure) - 1.0
-        usual = about.usual(grids.u, grids.pressure)
-        more = values[0] * (here - usual) + values[1] * load + values[2] * load * load
-        return np.asarray(1.0 + more / about.power_mw)
+        # Not by u with the other causes applied: the terms are the same for every model.
+        if about not in grids.cache:
+            _, here = grids.covariates[name]
+            grids.cache[about] = about.terms(grids.u, grids.pressure, here) / about.power_mw
+        return np.asarray(1.0 + np.array(values) @ grids.cache[about])
 
     def starts(screening: Screening) -> Sequence[Start]:
         if covariate_gain(screening.task, screening.model, name) < LEAST_SLOW_GAIN:
