@@ -26,6 +26,8 @@ SHELL := bash
 .PHONY: help setup demo demo-opcua test test-versions test-slow lint format bench bench-gate mutation repeat torture study study-diagnosis certify-partition docs lock clean
 
 export PYTHON
+# The matrices are small: on a busy machine more threads of OpenBLAS only wait for each other.
+export OPENBLAS_NUM_THREADS ?= 1
 ENV := source ./env.sh &&
 VALVEFLOW_DEMO ?= bash -c 'source env.sh && python -m valveflow_ros.ros.demo --output demo_output'
 PYTEST_ARGS ?=

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -74,6 +75,26 @@ def test_module_is_the_command():
             [sys.executable, '-m', module, '--version'], capture_output=True, text=True, check=True
         )
         assert done.stdout == f'valveflow {__version__}\n'
+
+
+@pytest.mark.parametrize(('wished', 'threads'), [(None, '1'), ('2', '2')])
+def test_one_thread_of_blas_unless_told_otherwise(wished, threads):
+    code = (
+        'import os, sys\n'
+        'from valveflow_ros.cli import main\n'
+        'def load(name):\n'
+        '    print("numpy" in sys.modules, os.environ["OPENBLAS_NUM_THREADS"])\n'
+        '    sys.exit()\n'
+        'main.load = load\n'
+        'main.main(["info", "x.mcap"])'
+    )
+    environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
+    if wished:
+        environment['OPENBLAS_NUM_THREADS'] = wished
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True, env=environment
+    )
+    assert done.stdout == f'False {threads}\n'
 
 
 def test_output_cut_off_by_a_reader_is_no_error():

@@ -188,6 +188,27 @@ def test_the_hidden_path_is_the_cheapest(costs, penalty):
     assert price(path) == pytest.approx(best, abs=1e-9)
 
 
+@given(
+    st.lists(st.floats(0.01, 30.0), min_size=1, max_size=60),
+    st.floats(0.5, 240.0), st.sampled_from([0.0, 0.03, 1.0, 1e4]), st.integers(0, 99),
+)  # fmt: skip
+def test_a_wander_is_whitened_as_by_its_dense_covariance(gaps_h, scale_h, ratio, seed):
+    rng, k = np.random.default_rng(seed), len(gaps_h)
+    hours = np.cumsum(gaps_h)
+    load, noise, table = (
+        rng.uniform(0.4, 1.2, k),
+        rng.uniform(0.5, 4.0, k),
+        rng.normal(size=(k, 3)),
+    )
+    apart = np.abs(hours[:, None] - hours)
+    covariance = np.diag(noise) + ratio * np.exp(-apart / scale_h) * np.outer(load, load)
+    factor = np.linalg.cholesky(covariance)
+    white = np.empty_like(table)
+    level = kernels.whiten_wander(hours, load, noise, ratio, scale_h, table, white)
+    assert white == pytest.approx(np.linalg.solve(factor, table), rel=1e-6, abs=1e-8)
+    assert level == pytest.approx(np.log(np.diag(factor)).sum(), rel=1e-8, abs=1e-8)
+
+
 def test_one_pass_and_two_passes_of_the_filter_agree(grids):
     x = rough_model().static(grids.u)
     path = np.zeros(len(x), dtype=np.uint8)

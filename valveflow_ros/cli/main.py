@@ -29,6 +29,9 @@ DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
 _SIGNALLED = 128
 # A second signal within this many seconds is ignored, so that the clean-up is completed.
 _ONCE_S = 2.0
+# The matrices are small. On a busy machine OpenBLAS waits so long for its other threads that
+# `diagnose` takes twice the processor time. Long loops have threads of their own.
+_BLAS_THREADS = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 # In the order in which a new user needs them: verb, module, description.
 VERBS: tuple[tuple[str, str, str], ...] = (
@@ -258,6 +261,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from valveflow_ros.cli.verbs.completion import complete
 
         complete([(name, about) for name, _, about in VERBS], parser_of)
+    for variable in _BLAS_THREADS:  # NumPy is not yet loaded
+        os.environ.setdefault(variable, '1')
     words = list(sys.argv[1:] if arguments is None else arguments)
     console = Console(
         sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words,

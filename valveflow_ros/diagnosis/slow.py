@@ -25,8 +25,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
+from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.grids import Grids
@@ -160,16 +161,14 @@ def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fi
     k, p = found.free.shape
     flat = found.power, *(found.free.T), *(() if column is None else (column,))
     table = np.column_stack(flat)
-    for lower, hours, ratio in _wanders(found):
-        white = solve_triangular(lower, table, lower=True)
+    for white, level, hours, ratio in _wanders(found, table):
         basis, size = np.linalg.qr(white[:, 1 : 1 + p])
         left = white - basis @ (basis.T @ white)
         rest = left[:, 0]
         cost = float(rest @ rest)
-        scale = -float(np.log(np.diag(lower)).sum())
         fit = _Fit(
-            scale - 0.5 * k * float(np.log(cost / k)),
-            scale - 0.5 * (k - p) * float(np.log(cost / (k - p)))
+            -level - 0.5 * k * float(np.log(cost / k)),
+            -level - 0.5 * (k - p) * float(np.log(cost / (k - p)))
             - float(np.log(np.abs(np.diag(size))).sum()),
             hours, ratio,
         )  # fmt: skip
@@ -181,12 +180,17 @@ def _fits(found: Levels, column: FloatArray | None = None) -> Iterator[tuple[_Fi
         yield fit, more
 
 
-def _wanders(found: Levels, most_h: float = math.inf) -> Iterator[tuple[FloatArray, float, float]]:
-    """Yield covariance factor, time scale and variance of every wander of the grid."""
+def _wanders(
+    found: Levels, table: FloatArray, most_h: float = math.inf
+) -> Iterator[tuple[FloatArray, float, float, float]]:
+    """Yield whitened columns, half the log determinant, time scale and ratio of every wander."""
     for hours in (h for h in _TIME_SCALES_H if h <= most_h):
-        wander = _covariance(found, hours)
         for ratio in (0.0, *_RATIOS) if hours == _TIME_SCALES_H[0] else _RATIOS:
-            yield cho_factor(np.diag(found.noise) + ratio * wander, lower=True)[0], hours, ratio
+            white = np.empty_like(table)
+            level = kernels.whiten_wander(
+                found.hours, found.load, found.noise, ratio, hours, table, white
+            )
+            yield white, level, hours, ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,15 +216,14 @@ def regressions(found: Levels, choices: Sequence[Sequence[int]]) -> list[Regress
     best: list[Regression | None] = [None] * len(choices)
     k = len(found.power)
     most_h = float(np.ptp(found.hours)) / 4.0
-    for lower, _, _ in _wanders(found, most_h):
-        white = solve_triangular(lower, np.column_stack([found.power, found.free]), lower=True)
-        level = -float(np.log(np.diag(lower)).sum())
+    table = np.column_stack([found.power, found.free])
+    for white, level, _, _ in _wanders(found, table, most_h):
         for i, columns in enumerate(choices):
             basis, size = np.linalg.qr(white[:, [1 + j for j in columns]])
             toward = basis.T @ white[:, 0]
             rest = white[:, 0] - basis @ toward
             cost = float(rest @ rest)
-            likelihood = level - 0.5 * k * float(np.log(cost / k))
+            likelihood = -level - 0.5 * k * float(np.log(cost / k))
             known = best[i]
             if known is None or likelihood > known.likelihood:
                 back = np.linalg.inv(size)
@@ -432,14 +435,13 @@ def _scored(
     kinds = np.array([s.name for s in single])
     paid = PENALTY * np.array([s.numbers for s in single])
     drift_at = int(np.flatnonzero(kinds == 'drift')[0])
-    for lower, _, ratio in _wanders(found):
-        white = solve_triangular(lower, table, lower=True)
+    for white, half, _, ratio in _wanders(found, table):
         basis, _ = np.linalg.qr(white[:, 1 : 1 + p])
         left = white - basis @ (basis.T @ white)
         rest, own = left[:, 0], left[:, 1 + p :]
         gram, toward = own.T @ own, own.T @ rest
         cost = float(rest @ rest)
-        level = -float(np.log(np.diag(lower)).sum()) - (_OF_WANDER if ratio else 0.0)
+        level = -half - (_OF_WANDER if ratio else 0.0)
 
         def worth(gain: FloatArray, cost: float = cost, level: float = level) -> FloatArray:
             rest = np.maximum(cost - gain, 1e-9 * cost)
