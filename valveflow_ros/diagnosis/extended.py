@@ -96,16 +96,18 @@ def _input(grids: Grids, model: Extended) -> FloatArray:
     if not chain:
         return grids.u
     key = tuple((a.name, a.values, a.extra) for a in chain)
-    if key not in grids.cache:
+    u = grids.cache.get(key)
+    if u is None:
         v = grids.v
         for a in chain:
             v = a.cause.act(v, a.values, grids)
-        inputs = [k for k in grids.cache if isinstance(k, tuple)]
+        # Other threads use the cache too.
+        inputs = [k for k in list(grids.cache) if isinstance(k, tuple)]
         if len(inputs) >= _REMEMBERED:
-            del grids.cache[inputs[0]]
-        u = grids.coarse(v * grids.density)
-        grids.cache[key] = np.where(grids.usable > 0, u, 0.0)
-    return grids.cache[key]
+            grids.cache.pop(inputs[0], None)
+        u = np.where(grids.usable > 0, grids.coarse(v * grids.density), 0.0)
+        grids.cache[key] = u
+    return u
 
 
 def drive(grids: Grids, model: Extended) -> Drive:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,7 +18,7 @@ from valveflow_ros.diagnosis.grids import ORDER, Grids
 from valveflow_ros.fit.descent import descend, gauss_newton
 from valveflow_ros.fit.problem import free_parameters, with_level_moved
 from valveflow_ros.fit.whitening import fit_ar
-from valveflow_ros.numerics import jit
+from valveflow_ros.numerics import cores, jit, run_in_threads
 from valveflow_ros.records import BoolArray, FloatArray
 
 # Causes that depend on unmeasured noise: simulations with several noise realisations.
@@ -251,13 +251,27 @@ def base_tangents(task: Task, model: Extended) -> FloatArray:
     path = region_path(model, flow_of(model, driven))
     here = answer(grids, model, driven, path)
     packed, steps = model.base.pack(), _base_steps(model.base, grids.size)
-    columns = []
-    for p in np.flatnonzero(base_mask(task, model)):
+
+    def column(p: int) -> FloatArray:
         moved = packed.copy()
         moved[p] += steps[p]
         other = replace(model, base=model.base.unpack(moved))
-        columns.append((answer(grids, other, driven, path) - here) / steps[p])
-    return np.column_stack(columns)
+        return np.asarray((answer(grids, other, driven, path) - here) / steps[p])
+
+    return _columns(len(here), column, [(int(p),) for p in np.flatnonzero(base_mask(task, model))])
+
+
+def _columns(
+    rows: int, column: Callable[..., FloatArray], places: Sequence[tuple[int, ...]]
+) -> FloatArray:
+    """Return ``column(*place)`` of every place, shape (rows, places), computed in threads."""
+    table = np.empty((rows, len(places)))
+
+    def work(j: int) -> None:
+        table[:, j] = column(*places[j])
+
+    run_in_threads(work, [(j,) for j in range(len(places))], cores())
+    return table
 
 
 def _slots(model: Extended) -> list[tuple[int, int]]:
@@ -281,19 +295,18 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
     """Return derivatives of the means by the parameters of the causes, (m, Q)."""
     grids = task.grids
     slots = _slots(model)
-    if not slots:
-        return np.empty((len(grids.power), 0))
     path = region_path(model, flow_of(model, drive(grids, model)))
-    columns = []
-    for c, k in slots:
+
+    def column(c: int, k: int) -> FloatArray:
         stage = model.active[c].cause.stage
         keep = None if stage == Stage.DYNAMICS else path
         h = model.active[c].cause.unknowns[k].step_on(grids)
         up, down = _shifted(model, c, k, h), _shifted(model, c, k, -h)
         width = up.active[c].values[k] - down.active[c].values[k]
         change = answer(grids, up, None, keep) - answer(grids, down, None, keep)
-        columns.append(change / max(width, 1e-12))
-    return np.column_stack(columns)
+        return np.asarray(change / max(width, 1e-12))
+
+    return _columns(len(grids.power), column, slots)
 
 
 def level_tangents(task: Task, model: Extended) -> FloatArray:
