@@ -334,6 +334,8 @@ def common_change(
     share_before = before[allowed] / sum(float(s.weights.sum()) for s in series)
     if _chance(normal, float(share_before[0]), float(share_before[-1])) > _KNOWN:
         return 0, 0, 0
+    # The last member before `known_ns` may be much older: a change until then is known.
+    edges = np.maximum(edges, known_ns)
     mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
     reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
     side = 0.5 * (1.0 - share)
