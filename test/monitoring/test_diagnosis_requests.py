@@ -161,6 +161,14 @@ def test_on_the_first_day_of_an_alarm_an_unsure_diagnosis_is_made_again(content)
     assert not reasons(bench.until(20))
 
 
+def test_a_clock_that_went_back_does_not_make_an_old_alarm_young():
+    bench = Screening(diagnosis_hour=-1, diagnosis_pause=8.0)
+    settle(bench, bench.made.request(MIDNIGHT_NS, bench.window, CURVE), UNSURE)
+    bench.alarm.active = bench.made._raised = True
+    bench.alarm.raised_ns = MIDNIGHT_NS + 30 * DAY_NS
+    assert not reasons(settle(bench, bench.until(24), UNSURE))
+
+
 NAMED = json.dumps({
     'verdict': 'named', 'not_told_apart': ['clock'],
     'causes': [{'parameters': {'t0_days': {'origin_ns': MIDNIGHT_NS - DAY_NS, 'value': 0.5}}}],

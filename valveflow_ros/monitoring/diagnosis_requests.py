@@ -282,7 +282,8 @@ class DiagnosisRequests:
     def _young(self, time_ns: int) -> bool:
         """Return True on the first day of the residual alarm, when every hour adds loads."""
         wanted = self._alarm.active and self.settings.flag('diagnosis_on_mismatch')
-        return wanted and time_ns - self._alarm.raised_ns < _DAY_NS
+        # The clock may have gone back to before the alarm, by more than a day.
+        return wanted and 0 <= time_ns - self._alarm.raised_ns < _DAY_NS
 
     def _want(self, reason: str) -> None:
         """Schedule a diagnosis as soon as possible."""
