@@ -156,11 +156,16 @@ def test_changes_before_the_known_time_are_left_out():
     assert common_change(pieces, 60_000) == (0, 0, 0)
     assert common_change(pieces, 10**9) == (0, 0, 0)
     assert common_change(pieces, 20_000)[0] == pytest.approx(29_500, abs=600)
+    times = 1000 * np.arange(80, dtype=np.int64)
+    times[30:] += 10**6  # no member for a long time, and the known time is in between
+    middle, low, high = common_change([piece(*series(1, 80, 30, 5.0), times)], 900_000)
+    assert 900_000 <= low <= middle <= high <= times[30]
 
 
-def test_no_change_has_no_time():
+@pytest.mark.parametrize('n', [4, 6, 40])
+def test_no_change_has_no_time(n):
     limit = 0.01
-    dated = [common_change([piece(*series(s, 40)), piece(*series(s + 1000, 40))], -1)[0]
+    dated = [common_change([piece(*series(s, n)), piece(*series(s + 1000, n))], -1)[0]
              for s in range(500)]  # fmt: skip
     assert np.mean(np.array(dated) > 0) <= 2.0 * limit
     still = piece(*series(1, 80), np.zeros(80, dtype=np.int64))

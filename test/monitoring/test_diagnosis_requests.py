@@ -161,6 +161,45 @@ def test_on_the_first_day_of_an_alarm_an_unsure_diagnosis_is_made_again(content)
     assert not reasons(bench.until(20))
 
 
+def test_a_clock_that_went_back_does_not_make_an_old_alarm_young():
+    bench = Screening(diagnosis_hour=-1, diagnosis_pause=8.0)
+    settle(bench, bench.made.request(MIDNIGHT_NS, bench.window, CURVE), UNSURE)
+    bench.alarm.active = bench.made._raised = True
+    bench.alarm.raised_ns = MIDNIGHT_NS + 30 * DAY_NS
+    assert not reasons(settle(bench, bench.until(24), UNSURE))
+
+
+NAMED = json.dumps({
+    'verdict': 'named', 'not_told_apart': ['clock'],
+    'causes': [{'parameters': {'t0_days': {'origin_ns': MIDNIGHT_NS - DAY_NS, 'value': 0.5}}}],
+})  # fmt: skip
+
+
+def taken_up(bench):
+    """Return a bench with the saved state of another."""
+    again = Screening()
+    model = SimpleNamespace(snapshot=dict, restore=lambda saved: None)
+    bench.made._mismatch = again.made._mismatch = model
+    again.made.restore(bench.made.snapshot())
+    return again
+
+
+def test_a_diagnosis_without_a_result_takes_back_nothing_and_revives_nothing(monkeypatch):
+    module = 'valveflow_ros.monitoring.diagnosis_requests'
+    monkeypatch.setattr(f'{module}.to_json', lambda curve: {})
+    monkeypatch.setattr(f'{module}.from_json', lambda saved: CURVE)
+    bench, onset_ns = Screening(), MIDNIGHT_NS - DAY_NS // 2
+    settle(bench, bench.made.request(MIDNIGHT_NS, bench.window, CURVE), NAMED)
+    later_ns = MIDNIGHT_NS + DAY_NS
+    (_, asked) = bench.made.request(later_ns, bench.window, CURVE)
+    bench.made.refuse(asked.task.request_ns, 'It was cancelled.')
+    for made in (bench.made, taken_up(bench).made):
+        assert made.named_onset_ns(0) == onset_ns
+        # A reference that was set after the result accepts the cause.
+        assert made.named_onset_ns(MIDNIGHT_NS + 1) is None
+        assert made._found.unsure
+
+
 def test_a_misfit_is_said_once_and_its_end_too():
     bench = Screening(diagnosis_hour=-1)
     bench.until(1)

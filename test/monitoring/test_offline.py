@@ -297,6 +297,16 @@ def test_a_clock_set_back_restarts_the_engine_once_at_the_right_row(cut):
     same(told, events)
 
 
+def test_progress_has_the_time_of_the_newest_row_after_the_clock_went_back():
+    monitor, times = Monitor(SETTINGS), []
+    feed_rows(monitor, plant_table(1, N))
+    monitor.restart(CLOCK_BACK)
+    second = plant_table(2, N, start_ns=START_NS - 7200 * NS_PER_S)
+    feed_rows(monitor, second, tell=lambda time_ns, what: times.append(time_ns))
+    assert times
+    assert set(times) <= set(second.time_ns.tolist())
+
+
 def held(monitor):
     """Return times and segments of what a fit would see."""
     task = next(e.task for e in monitor.request_fit() if isinstance(e, FitRequested))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, ndtri, stdtr
+from scipy.special import fdtrc, ndtri, stdtr
 
 from valveflow_ros.curve.characteristic import Characteristic, piece_of
 from valveflow_ros.records import (
@@ -327,12 +327,15 @@ def common_change(
     order = np.argsort(np.concatenate([s.time_ns for s in series]), kind='stable')
     variance = max(float(np.sum(weights * rest**2)) / freedom, _LEAST_VARIANCE)
     likelihood = np.where(allowed, 0.5 * gain / (variance * _widening(rest[order])), -math.inf)
-    # The tail of chi-square with one level per piece, as the normal deviate of one level.
-    tail = float(chdtrc(max(sided[best], 1), 2.0 * likelihood[best]))
+    # The tail of F with one level per piece, as the normal deviate of one level.
+    levels = max(int(sided[best]), 1)
+    tail = float(fdtrc(levels, freedom, 2.0 * likelihood[best] / levels))
     normal = float(-ndtri(0.5 * tail)) if tail > 0.0 else _FAR
     share_before = before[allowed] / sum(float(s.weights.sum()) for s in series)
     if _chance(normal, float(share_before[0]), float(share_before[-1])) > _KNOWN:
         return 0, 0, 0
+    # The last member before `known_ns` may be much older: a change until then is known.
+    edges = np.maximum(edges, known_ns)
     mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
     reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
     side = 0.5 * (1.0 - share)

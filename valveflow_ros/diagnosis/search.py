@@ -252,7 +252,7 @@ SCREEN_SHARE = 0.1
 NOT_TOLD_APART = 10.0
 # Of the largest power. The breakpoints of real valves are rounded; fixed on units built from
 # physics with numbers 5001 to 5012.
-_LEAST_BEND = 0.0025
+_LEAST_HEIGHT = 0.0025
 KEPT_LEAST = 8.0
 STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
 _SHORT_STEPS_MW = (1.0, 0.4)
@@ -414,7 +414,7 @@ def _rounded(task: Task, rival: Rival) -> str:
     """Return why a bend is none: the straight pieces of a healthy valve miss as much; or ''."""
     if rival.added.name != 'curve_shape':
         return ''
-    height, least = abs(rival.added.values[0]), _LEAST_BEND * float(np.max(task.grids.power))
+    height, least = abs(rival.added.values[0]), _LEAST_HEIGHT * float(np.max(task.grids.power))
     if height > least:
         return ''
     return f'a healthy valve differs from straight pieces by up to {least:.2g} MW, this by less'

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -55,6 +55,14 @@ class Journal(Protocol):
         """Return the line."""
 
 
+class _Found(NamedTuple):
+    """What the last diagnosis with a result said; one without a result leaves it as it is."""
+
+    window_end_ns: int = 0
+    onset_ns: int | None = None
+    unsure: bool = False  # it named no cause, or not one alone
+
+
 class DiagnosisRequests:
     """Check whether the model fits, request diagnoses, and keep the last one.
 
@@ -82,8 +90,7 @@ class DiagnosisRequests:
         self.misfit: Misfit = NOTHING
         self.sentence = ''
         self.last: Diagnosed | None = None
-        self._onset_ns: int | None = None
-        self._unsure = False  # the last diagnosis named no cause, or not one alone
+        self._found = _Found()
         # `curve.model` creates a new object at each access, and rows arrive one by one.
         self._model: tuple[Characteristic, RegionalModel] | None = None
         self._hour: int | None = None
@@ -101,13 +108,11 @@ class DiagnosisRequests:
         return self._pending is not None
 
     def named_onset_ns(self, reference_ns: int) -> int | None:
-        """Return the onset of the cause named by the last diagnosis; None if there is none.
+        """Return the onset of the cause named by the last result; None if there is none.
 
         Diagnoses from before the current reference are ignored: it includes their causes.
         """
-        if self.last is None or self.last.task.window_end_ns <= reference_ns:
-            return None
-        return self._onset_ns
+        return None if self._found.window_end_ns <= reference_ns else self._found.onset_ns
 
     def watch(
         self, block: PredictionBlock, temperature_degc: FloatArray, curve: Characteristic | None
@@ -151,7 +156,7 @@ class DiagnosisRequests:
         tonight = another and self.settings.whole('diagnosis_hour') >= 0
         self._night = night
         reason = self._wanted or (NIGHTLY if tonight else '')
-        if not reason and self._unsure and self._young(time_ns):
+        if not reason and self._found.unsure and self._young(time_ns):
             reason = MORE_DATA
         if (
             reason and self._may_ask(time_ns)
@@ -180,8 +185,7 @@ class DiagnosisRequests:
         task = self._settle(request_ns)
         if task is None:
             return []
-        self.last, self._onset_ns = Diagnosed(task, content, ''), onset_ns(content)
-        self._unsure = _is_unsure(content)
+        self.last, self._found = Diagnosed(task, content, ''), _found(task, content)
         mark = hashlib.sha256(content.encode()).hexdigest()[:12]
         kind, model_id = JournalKind.DIAGNOSED, task.curve.model_id
         return [self.last, self._journal(kind, request_ns, model_id, mark)]
@@ -203,6 +207,7 @@ class DiagnosisRequests:
             'misfit': [self.misfit.score, self.misfit.name, self.misfit.hint],
             'sentence': self.sentence,
             'last': None if last is None else [_plain(last.task), last.content, last.reason],
+            'found': list(self._found),
             'hour': self._hour,
             'night': self._night,
             'night_before': self._night_before,
@@ -219,9 +224,13 @@ class DiagnosisRequests:
         self.misfit, self.sentence = Misfit(*saved['misfit']), saved['sentence']
         last, pending = perhaps(saved, 'last', list), perhaps(saved, 'pending', dict)
         self.last = None if last is None else Diagnosed(self._task(last[0]), last[1], last[2])
-        content = '' if last is None else last[1]
-        self._onset_ns = onset_ns(content) if content else None
-        self._unsure = bool(content) and _is_unsure(content)
+        if 'found' in saved:
+            self._found = _Found(*saved['found'])
+            kinds = [type(v) for v in self._found]
+            if kinds not in ([int, int, bool], [int, type(None), bool]):
+                raise DataError("The saved state has 'found' of another kind.")
+        elif self.last is not None and self.last.content:  # of an earlier version
+            self._found = _found(self.last.task, self.last.content)
         self._pending = None if pending is None else self._task(pending)
         self._hour, self._night, self._night_before, self._asked_ns, self._named_ns = (
             perhaps(saved, name, int)
@@ -273,7 +282,8 @@ class DiagnosisRequests:
     def _young(self, time_ns: int) -> bool:
         """Return True on the first day of the residual alarm, when every hour adds loads."""
         wanted = self._alarm.active and self.settings.flag('diagnosis_on_mismatch')
-        return wanted and time_ns - self._alarm.raised_ns < _DAY_NS
+        # The clock may have gone back to before the alarm, by more than a day.
+        return wanted and 0 <= time_ns - self._alarm.raised_ns < _DAY_NS
 
     def _want(self, reason: str) -> None:
         """Schedule a diagnosis as soon as possible."""
@@ -325,6 +335,10 @@ class DiagnosisRequests:
             return None
         self._pending = None
         return task
+
+
+def _found(task: DiagnosisTask, content: str) -> _Found:
+    return _Found(task.window_end_ns, onset_ns(content), _is_unsure(content))
 
 
 def _is_unsure(content: str) -> bool:

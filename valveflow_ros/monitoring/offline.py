@@ -66,11 +66,11 @@ def feed_rows(
         events += fed.events
         for event in fed.events:
             if isinstance(event, FitRequested):
-                tell(event.task.request_ns, 'fit')
+                tell(monitor.last_ns, 'fit')
                 events += outcome_of(monitor, event.task)
             elif isinstance(event, DiagnosisRequested) and diagnose is not None:
                 request_ns = event.task.request_ns
-                tell(request_ns, 'diagnosis')
+                tell(monitor.last_ns, 'diagnosis')
                 try:
                     events += monitor.diagnosing.adopt(request_ns, diagnose(event.task))
                 except DataError as error:
