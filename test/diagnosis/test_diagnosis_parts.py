@@ -8,6 +8,7 @@ import itertools
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import needs_jit
 
-from valveflow_ros.diagnosis import kernels, record_faults
+from valveflow_ros.diagnosis import kernels, record_faults, search
 from valveflow_ros.diagnosis.cause import FittedCause, SentenceValues, Stage
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import sign_flip
@@ -24,7 +25,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
-from valveflow_ros.diagnosis.search import _turned, simplified
+from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, _turned, simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -316,3 +317,35 @@ def test_a_record_of_minutes_is_refused():
 def test_a_small_bend_of_the_other_sign_does_not_count(height: float, counts: bool) -> None:
     bend = FittedCause(catalogue()['curve_shape'], (height, 1600.0, 100.0))
     assert _turned(Extended(rough_model(), (bend,)), 1.0) is counts
+
+
+@pytest.mark.parametrize(('doubted', 'weighed'), [
+    ({'curve_shape'}, ['choked', 'exponent']),  # saturation explains too much less
+    (set(), ['curve_shape']),
+])  # fmt: skip
+def test_a_cause_in_doubt_hides_no_other(
+    monkeypatch: pytest.MonkeyPatch, doubted: set[str], weighed: list[str]
+) -> None:
+    """The best candidate is in doubt, and the next one explains much less."""
+    model, seen = Extended(rough_model()), []
+    scores = {'curve_shape': 0.0, 'choked': 50.0, 'exponent': 55.0, 'saturation': 70.0}
+    rivals = [
+        Rival(Extended(model.base, (added,)), added, score)
+        for name, score in scores.items()
+        for added in [FittedCause(catalogue()[name], (0.0,) * len(catalogue()[name].unknowns))]
+    ]
+
+    def weigh(task: object, without: object, rival: Extended, size: int) -> SimpleNamespace:
+        seen.extend(rival.names)
+        return SimpleNamespace(enough=False, reason=lambda: 'it is too small')
+
+    def doubt(task: object, rival: Rival) -> str:
+        return 'it is in doubt' if rival.added.name in doubted else ''
+
+    monkeypatch.setattr(search, '_rivals', lambda *_: rivals)
+    monkeypatch.setattr(search, '_visible', lambda found, rivals, barred: rivals)
+    monkeypatch.setattr(search, '_without_onset', lambda *_: '')
+    monkeypatch.setattr(search, '_rounded', doubt)
+    monkeypatch.setattr(search, 'weigh', weigh)
+    assert not _add(SearchResult(None, model, model), set())  # type: ignore[arg-type]
+    assert seen == weighed

@@ -357,16 +357,18 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
     rivals = _visible(found, _rivals(found, barred), barred)
     if not rivals:
         return False
-    best = rivals[0].score
+    best: float | None = None
     for rival in rivals:
-        if rival.score - best > NOT_TOLD_APART:
+        if best is not None and rival.score - best > NOT_TOLD_APART:
             break
         doubt = (
             rival.added.beyond or _without_onset(found.task, rival) or _rounded(found.task, rival)
         )
         if doubt:
+            # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
             continue
+        best = rival.score if best is None else best
         without = found.model
         evidence = weigh(found.task, without, rival.model, rival.added.size)
         if not evidence.enough:
