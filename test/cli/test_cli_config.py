@@ -83,6 +83,14 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, part):
     assert 'x.yaml' in sentence
 
 
+def test_all_faults_of_a_file_are_named_at_once(run, tmp_path):
+    file = tmp_path / 'x.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    dellay: 3\n    block: fast\n    delay: 2.0\n')
+    sentence = run('config', 'check', file).refused()
+    assert "'dellay' does not exist; did you mean 'delay'?" in sentence
+    assert "'block' must be a number" in sentence
+
+
 @pytest.mark.parametrize(
     'text',
     [

@@ -150,10 +150,15 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
             f"{file}: ROS 2 does not take '{stray}' where it stands. Put the lines '/**:' and "
             "'  ros__parameters:' above all parameters, and four blanks before each of them."
         )
-    try:
-        return {name: parameter(name).check(value) for name, value in _flat(content).items()}
-    except ParameterError as error:
-        raise InputError(f'{file}: {error}') from None
+    given, wrong = {}, []
+    for name, value in _flat(content).items():
+        try:
+            given[name] = parameter(name).check(value)
+        except ParameterError as error:
+            wrong.append(str(error))
+    if wrong:
+        raise InputError(f'{file}: {" ".join(wrong)}')
+    return given
 
 
 def _without_node(content: dict[Any, Any]) -> str:
