@@ -52,6 +52,18 @@ def test_the_table_brings_back_the_power(run, model, tmp_path):
     assert 'Below 150.00 MW and above' in ran.out
 
 
+def test_why_not_to_rely_on_a_curve_is_repeated(run, model, tmp_path):
+    told = 'The unit changed within these data.'
+    file = model(notes=(told,), reference_pressure_mpa=16.0)
+    words = ['compensate', '--model', file, '-o', tmp_path / 'x.csv', '--overwrite', '--pressure']
+    ran = run(*words, '17')
+    assert ran.status == 0
+    assert told in ran.err
+    assert 'usual pressure' not in ran.err
+    far = run(*words, '25')
+    assert 'The usual pressure of the data was 16.0 MPa. At 25 MPa the table' in far.err
+
+
 def test_programs_get_the_same_numbers(run, model, tmp_path):
     table = tmp_path / 'table.parquet'
     ran = run('compensate', '--model', model(), '-o', table, '--points', '7', '--json',

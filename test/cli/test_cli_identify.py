@@ -8,6 +8,7 @@ import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 from logged import rewritten
 from streams import needs_jit
@@ -50,6 +51,20 @@ def test_the_curve_is_the_plants(run, logs, results, curves):
     assert content['format'] == 'valveflow/characteristic'
     assert content['version'] == 2
     assert content['optimal'] is True
+
+
+def test_a_part_of_a_log_is_taken_by_its_times(run, logs, tmp_path):
+    start, end = '2023-11-15T02:00', '2023-11-15T08:00Z'
+    words = ['identify', logs / 'plant.csv', '-o']
+    ran = run(*words, tmp_path / 'a', '--from', start, '--to', end, '--json')
+    assert ran.status == 0, ran.err
+    window = json.loads(ran.out)['window']
+    assert window['start_ns'] == pd.Timestamp(start).value
+    assert window['end_ns'] == pd.Timestamp(end).value
+    none = run(*words, tmp_path / 'b', '--from', '2030-01-01')
+    assert 'has no readings between these times' in none.refused()
+    wrong = run(*words, tmp_path / 'b', '--to', 'noon')
+    assert "'noon' is no time such as" in wrong.refused(2)
 
 
 @pytest.mark.parametrize('name', ['plant.csv', 'plant.parquet'])

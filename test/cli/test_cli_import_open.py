@@ -82,10 +82,10 @@ def test_what_only_the_person_knows_is_left_to_be_filled_in(run, table, tmp_path
     assert 'with your names in place of THEIRS' in said
     assert 'recognised as main_steam_temperature or generated_power' in said
     words = last_command(said)
-    assert {'main_steam_temperature=THEIRS', 'generated_power=THEIRS'} < set(words)
+    # The temperature is often not recorded, and taken as constant.
+    assert {'main_steam_temperature=540', 'generated_power=THEIRS'} < set(words)
     assert 'main_steam_pressure=Steam press:bar' in words
-    filled = [w.replace('temperature=THEIRS', 'temperature=X1:K').replace('THEIRS', 'X2:kW')
-              for w in words]  # fmt: skip
+    filled = [w.replace('THEIRS', 'X2:kW') for w in words]
     assert run(*filled).status == 0
 
 

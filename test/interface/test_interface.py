@@ -56,6 +56,16 @@ class TestLog:
         for info in SIGNALS:
             np.testing.assert_array_equal(back[info.column], frame[info.column])
 
+    def test_between_two_times_it_is_the_log_of_these_rows(self, simulation):
+        frame = simulation.to_dataframe().head(3000)
+        start, end = (frame['time'].iloc[k] for k in (1000, 1999))
+        log = vf.open_log(frame)
+        part = log.between(start.value, end.value).to_dataframe()
+        pd.testing.assert_frame_equal(part, vf.open_log(frame.iloc[1000:2000]).to_dataframe())
+        assert len(log.between(None, end.value).to_dataframe()) == 2000
+        with pytest.raises(InputError, match='no readings between these times'):
+            log.between(end.value + 10**15, None)
+
     def test_order_time_kinds_and_gaps_of_a_dataframe(self, simulation):
         frame = simulation.to_dataframe().head(60)
         want = vf.open_log(frame).to_dataframe()
@@ -291,6 +301,13 @@ class TestMonitor:
     def told(cls, heard):
         faulty = vf.simulate(1.2, 5, effects=['gain_step:g=-0.05,t0_days=0.8']).log
         return vf.monitor(faulty, parameters={**QUICK, 'refit_segments': 40}, progress=heard)
+
+    def test_without_diagnoses_no_parameter_asks_for_one(self, simulation):
+        frame = simulation.to_dataframe().head(3000)
+        asked = {'diagnosis_hour': 3, 'diagnosis_on_mismatch': True}
+        settings = vf.monitor(frame, parameters=asked, diagnose=False).settings
+        assert settings.whole('diagnosis_hour') == -1
+        assert not settings.flag('diagnosis_on_mismatch')
 
     def test_progress_follows_the_rows_and_names_each_fit_and_diagnosis(self, told, heard):
         shares = [share for share, _ in heard.told]

@@ -134,9 +134,13 @@ def test_a_curve_of_other_days_gets_the_form_of_its_reference():
 
 def test_loads_in_sentences_are_those_of_the_plant():
     short = vf.identify(vf.simulate(2.0, 1, unit=UNIT, recording='minute').log)
-    loads = re.findall(r'at about ([0-9]+) MW', ' '.join(short.characteristic.notes))
-    assert loads
-    assert all(80.0 < float(load) < 360.0 for load in loads)
+    said = re.findall(
+        r'(\d+) % opening \((\d+) MW at ([\d.]+) MPa\)', ' '.join(short.characteristic.notes)
+    )
+    assert said
+    for opening, power, pressure in (map(float, each) for each in said):
+        assert 80.0 < power < 360.0
+        assert short.characteristic.power([opening], [pressure]) == pytest.approx(power, abs=5.0)
 
 
 def test_too_little_data_for_an_axis_that_is_asked_for_is_refused():

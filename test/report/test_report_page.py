@@ -22,7 +22,7 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Signal
 from valveflow_ros.report import page
-from valveflow_ros.report.answer import confidence_table, gain_by_load
+from valveflow_ros.report.answer import confidence_table, doubt, gain_by_load
 from valveflow_ros.report.curve import band
 from valveflow_ros.report.data import gaps, rejected, usable_share
 from valveflow_ros.report.diagnosis import diagnosis_page
@@ -96,13 +96,23 @@ def test_gain_by_load_is_the_slope_of_the_power_over_the_opening(make, form):
     data = replace_characteristic(data, **form)
     rows = gain_by_load(data)
     assert rows
-    for _, p, v, gain, error in rows:
+    for _, p, v, gain, error, low, high in rows:
         up, down = data.characteristic.power([v + 1e-4, v - 1e-4], [p, p])
         assert gain == pytest.approx((up - down) / 2e-4, rel=1e-3)
         assert error > 0.0
+        assert 0.0 < low <= high
     values = data.table.values.copy()
     values[:, Signal.GENERATED_POWER] = 200.0
     assert gain_by_load(replace(data, table=replace(data.table, values=values))) == []
+
+
+def test_a_valve_without_effect_is_doubted(make, monkeypatch):
+    data = make()
+    assert doubt(data) == ''
+    flat = tuple(replace(piece, slope=1e-6) for piece in data.characteristic.pieces)
+    monkeypatch.setattr('valveflow_ros.report.answer.explained', lambda _: 0.99)
+    told = doubt(replace_characteristic(data, pieces=flat))
+    assert 'the power follows the pressure alone' in told
 
 
 def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):

@@ -11,7 +11,7 @@ import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime, timezone, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
@@ -21,6 +21,7 @@ from valveflow_ros.report.terminal.progress import Progress as ProgressLine
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.files import Result
+    from valveflow_ros.interface.logs import Log
     from valveflow_ros.interface.mapping import LogMapping
 
 # Terminal control characters and those that change the text direction, except tabs and newlines.
@@ -305,7 +306,23 @@ def add_analysis_options(parser: ArgumentParser) -> None:
         '--table', action='store_true',
         help='also write what each picture shows as CSV: DIR/tables',
     )  # fmt: skip
+    for name, option, what in (('start', '--from', 'first'), ('end', '--to', 'last')):
+        parser.add_argument(
+            option, metavar='TIME', dest=name, default='',
+            help=f'the {what} time to use, such as 2026-01-31T06:00; in the zone of --time-zone',
+        )  # fmt: skip
     add_mapping(parser)
+
+
+def log_of(options: Namespace, mapping: LogMapping, console: Console) -> Log:
+    """Open the log of an analysis, between the times asked for."""
+    from valveflow_ros.interface.logs import open_log
+    from valveflow_ros.records import zone_of
+
+    zone = zone_of(mapping.table.time_zone)
+    start, end = (time_ns(text, zone) if text else None for text in (options.start, options.end))
+    console(0.02, 'reading')
+    return open_log(options.log, mapping, progress=console).between(start, end)
 
 
 def checked_parameters(options: Namespace) -> dict[str, Any]:
@@ -346,13 +363,13 @@ def write_results(
     return VerbResult('\n'.join([text, *done.words]), {**data, **files, **kept})
 
 
-def time_ns(text: str) -> int:
-    """Return a time in ns; UTC if it gives no zone."""
+def time_ns(text: str, zone: tzinfo | None = None) -> int:
+    """Return a time in ns; in ``zone``, or UTC, if it gives none."""
     try:
-        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+        moment = datetime.fromisoformat(text.replace('Z', '+00:00').replace(' UTC', '+00:00'))
     except ValueError:
         raise UsageError(f"'{text}' is no time such as 2026-01-31T06:00Z.") from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=zone or timezone.utc)
     return round(moment.timestamp() * 1e6) * 1000
 
 

@@ -337,7 +337,9 @@ def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) 
     return (
         f'The unit changed within these data: since about {minute(since_ns)} it gives '
         f'{short(abs(size), 1)} MW {side} at the same opening and pressure, so this curve is a '
-        'mixture of before and after. "valveflow diagnose" looks for the cause.'
+        'mixture of before and after. "valveflow diagnose" looks for the cause; "valveflow '
+        f'identify --from {minute(since_ns).removesuffix(" UTC").replace(" ", "T")}Z" gives the '
+        'curve since then.'
     )
 
 

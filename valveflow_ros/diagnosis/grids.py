@@ -11,7 +11,15 @@ import numpy as np
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.numerics import output_size
-from valveflow_ros.records import NS_PER_S, BoolArray, ByteArray, FloatArray, SampleTable, Signal
+from valveflow_ros.records import (
+    COARSE_STEP_S,
+    NS_PER_S,
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    SampleTable,
+    Signal,
+)
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
 
@@ -301,7 +309,6 @@ def _lift(v: FloatArray) -> float:
 
 # Effects hidden by sampling and compression.
 
-_COARSE_STEP_S = 20.0
 _STEPS_HIDDEN = 1.0  # lags shorter than this many steps of a coarse table
 _MOVES_HIDDEN = 3.0  # a backlash below this many typical moves of the opening within a row
 _BANDS_HIDDEN = 4.0  # or this many dead bands
@@ -320,13 +327,13 @@ def blur_of(v: FloatArray, step_s: float, compression: Compression | None) -> Bl
         opening = compression.updates.get(Signal.VALVE_OPENING)
         band = 0.0 if opening is None else _BANDS_HIDDEN * opening.dead_band
         return Blur(
-            max(0.5 * interval_s, step_s if step_s >= _COARSE_STEP_S else 0.0),
+            max(0.5 * interval_s, step_s if step_s >= COARSE_STEP_S else 0.0),
             max(band, _usual_move(v)),
             f'cannot be judged: values of this compressed log are typically {interval_s:.0f} s '
             'apart, which hides',
             True,
         )  # fmt: skip
-    if step_s < _COARSE_STEP_S:
+    if step_s < COARSE_STEP_S:
         return Blur()
     return Blur(
         _STEPS_HIDDEN * step_s, _usual_move(v),

@@ -26,7 +26,7 @@ from valveflow_ros.fit.refine import Refined
 from valveflow_ros.fit.residual_chart import design_chart, slow_wander
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.numerics import running_average
-from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, SegmentKind
+from valveflow_ros.records import COARSE_STEP_S, NS_PER_S, ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
 
 _Z95 = 1.959963984540054
@@ -103,15 +103,19 @@ def from_refined(
         (float(b - _Z95 * s), float(b + _Z95 * s))
         for b, s in zip(knots[1:-1], knot_se, strict=True)
     )
-    flow = _flow_at_ends(m, samples)
+    measured = samples.power_mw[samples.usable > 0]
+    flow = np.clip(_flow_at_ends(m, samples), measured.min(), measured.max())
     ends = np.concatenate([flow, m.levels])
     edges = [float(ends.min()), *m.levels.tolist(), float(ends.max())]
     error = error[3 * j - 1 :]
     level_errors = np.append(result.level_stderr, math.nan)
+    step_s = task.settings.real('sample_period')
+    times, delays = m.time_constants.tolist(), m.delays.tolist()
     dynamics = tuple(
         RegionDynamics(
-            edges[i], edges[i + 1], float(m.time_constants[i]), float(m.delays[i]),
-            float(m.time_constants[i] * error[i]), float(error[m.regions + i]),
+            edges[i], edges[i + 1], times[i], delays[i],
+            _time_error(times[i], float(times[i] * error[i]), step_s),
+            _time_error(delays[i], float(error[m.regions + i]), step_s),
             float(level_errors[i]),
         )
         for i in range(m.regions)
@@ -148,6 +152,11 @@ def from_refined(
             result.prediction_mw,
         ),
     )
+
+
+def _time_error(time_s: float, error_s: float, step_s: float) -> float:
+    """Return the standard error of a time; rows far apart hide shorter times than their step."""
+    return max(error_s, step_s) if time_s < step_s >= COARSE_STEP_S else error_s
 
 
 def _flow_at_ends(m: RegionalModel, samples: Samples) -> FloatArray:
@@ -309,11 +318,20 @@ def _sentence(c: Characteristic, number: int, piece: Piece, found: Support) -> s
     else:
         rests = 'has steady data at one load only'
     places = _missing(piece, np.array(found.levels))
-    loads = ' and one at '.join(f'{short(piece.slope * u + piece.intercept)} MW' for u in places)
+    loads = ' and one at '.join(_operation(c, piece, u) for u in places)
     return (
         f'{name} {rests}, so its slope is uncertain. One hour of constant operation at about '
         f'{loads} would give it.'
     )
+
+
+def _operation(c: Characteristic, piece: Piece, u: float) -> str:
+    """Return the operation at a u on a piece, at the usual pressure, in words."""
+    power, pressure = f'{short(piece.slope * u + piece.intercept)} MW', c.reference_pressure_mpa
+    if not math.isfinite(pressure):
+        return power
+    opening = u / pressure**c.pressure_exponent
+    return f'{opening:.0f} % opening ({power} at {pressure:.1f} MPa)'
 
 
 def _missing(piece: Piece, levels: FloatArray) -> list[float]:

@@ -42,6 +42,7 @@ from valveflow_ros.records import (
     Signal,
     SpecialSegment,
 )
+from valveflow_ros.report.answer import doubt
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
@@ -74,8 +75,9 @@ class Identification(Result):
 
     @property
     def characteristic(self) -> Characteristic:
-        """Return the curve."""
-        return self.data.characteristic
+        """Return the curve; its notes begin with the reasons not to rely on it."""
+        c, doubts = self.data.characteristic, (self.data.mixture, doubt(self.data))
+        return replace(c, notes=(*filter(None, doubts), *c.notes))
 
     @property
     def table(self) -> SampleTable:
@@ -90,7 +92,7 @@ class Identification(Result):
     @property
     def notes(self) -> tuple[str, ...]:
         """Return notes on how the data were read, and on the curve."""
-        return (*self.data.notes, *self.characteristic.notes)
+        return (*self.data.notes, *self.data.characteristic.notes)
 
     @property
     def output_unit(self) -> str:

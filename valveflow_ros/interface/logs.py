@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from valveflow_ros.records import (
     Signal,
     table_to_readings,
 )
+from valveflow_ros.report.words import moment
 from valveflow_ros.signals.compression import Compression, find_compression, held_readings
 from valveflow_ros.signals.units import (
     DIFFERENCES,
@@ -114,6 +116,28 @@ class Log:
         """Return the unit of the readings of generated_power: MW, or that of a flow."""
         unit = self.units.get(Signal.GENERATED_POWER, 'MW')
         return engine_unit(Signal.GENERATED_POWER, unit)
+
+    def between(self, start_ns: int | None, end_ns: int | None) -> Log:
+        """Return the log with the readings from a time on and up to another; None: no limit.
+
+        Raises
+        ------
+        InputError
+            There are none between the two.
+        """
+        if start_ns is None and end_ns is None:
+            return self
+        cut = partial(_between, start_ns=start_ns, end_ns=end_ns)
+        readings = cut(self.readings)
+        if not len(readings):
+            times = self.readings.time_ns
+            held = (
+                f' It lasts from {moment(int(times.min()))} to {moment(int(times.max()))}.'
+                if len(times) else ''
+            )  # fmt: skip
+            raise InputError(f'{self.name} has no readings between these times.{held}')
+        updates = None if self.updates is None else cut(self.updates)
+        return replace(self, readings=readings, updates=updates)
 
     def parameters(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         """Return the given parameters with those that follow from the log's units, and notes.
@@ -202,6 +226,18 @@ class Log:
             if (quality[:, info.signal] == Quality.UNCERTAIN).any():
                 columns[info.column + QUALITY_SUFFIX] = quality[:, info.signal]
         return pd.DataFrame(columns)
+
+
+def _between(readings: Readings, start_ns: int | None, end_ns: int | None) -> Readings:
+    inside = np.ones(len(readings), dtype=bool)
+    if start_ns is not None:
+        inside &= readings.time_ns >= start_ns
+    if end_ns is not None:
+        inside &= readings.time_ns <= end_ns
+    return Readings(
+        readings.time_ns[inside], readings.signal[inside], readings.value[inside],
+        readings.quality[inside],
+    )  # fmt: skip
 
 
 def open_log(

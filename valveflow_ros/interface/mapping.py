@@ -282,6 +282,11 @@ def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
         if remedy.option in _TABLE:
             table = replace(table, **{_TABLE[remedy.option]: remedy.value})
             continue
+        if remedy.option == 'constant':
+            name, value, _ = _constant(remedy.value)
+            columns.pop(name, None)
+            constants[name] = value
+            continue
         column = _column(remedy.value)
         if column.theirs != THEIRS:
             columns[column.name] = column

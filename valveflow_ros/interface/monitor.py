@@ -316,9 +316,9 @@ class MonitorResult(Result):
 
     @property
     def advice(self) -> list[str]:
-        """Return each named cause's effect in MW and its advice, from the latest diagnosis."""
-        named = {c['name']: c for _, d in self.diagnoses for c in d['causes']}
-        told = [advice(name, c['meaning'], c['to_do']) for name, c in named.items()]
+        """Return effect in MW and advice of the causes that were named last."""
+        named = [d['causes'] for _, d in self.diagnoses if d['causes']]
+        told = [advice(c['name'], c['meaning'], c['to_do']) for c in (named or [[]])[-1]]
         return [words for words in told if words]
 
     def texts(self) -> dict[str, str]:
@@ -424,7 +424,8 @@ def monitor(
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
-    given = {**({} if diagnose else _NO_DIAGNOSIS), **(parameters or {})}
+    # A parameter file of `config init` has all parameters, so it must not decide.
+    given = {**(parameters or {}), **({} if diagnose else _NO_DIAGNOSIS)}
     model = model or given.get('model_file') or None
     if model is not None:
         name = 'The model' if isinstance(model, ExtendedModel) else model

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from valveflow_ros.curve.characteristic import (
     Characteristic,
     Choice,
     RegionDynamics,
+    piece_of,
 )
 from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.fit.result import forms_apart, wrong_form
@@ -43,6 +45,7 @@ from valveflow_ros.signals.static_form import OPENING
 
 # Below this explained fraction of the power, it depends on something else, or a signal is wrong.
 _LITTLE = 0.8
+_NO_EFFECT = 0.1  # of the range of the power, for the whole range of the opening
 _FLAT = 0.2  # slope relative to the steepest piece, below which a piece is reported as flat
 
 
@@ -66,7 +69,7 @@ def doubt(data: Identified) -> str:
             f'Do not rely on this curve: it explains only {percent(share)} of the variance of the '
             'power. Look whether a signal is constant, taken for another one, or in another unit.'
         )
-    told = []
+    told = [words] if (words := _no_effect(data)) else []
     if misfit is not None:
         told.append(
             f'Do not rely on this curve: it is wrong by {misfit_words(misfit)}. The power depends '
@@ -75,6 +78,23 @@ def doubt(data: Identified) -> str:
     if form := wrong_form(data.characteristic):
         told.append(form)
     return ' '.join(told)
+
+
+def _no_effect(data: Identified) -> str:
+    """Return a warning if the power follows the pressure and hardly the opening; else empty."""
+    gains = gain_by_load(data)
+    if not gains:
+        return ''
+    opening = data.table.column(Signal.VALVE_OPENING)
+    reach = float(np.ptp(np.nanquantile(opening, (0.01, 0.99))))
+    effect, loads = max(abs(g.gain) for g in gains) * reach, gains[-1].load - gains[0].load
+    if effect > _NO_EFFECT * loads:
+        return ''
+    return (
+        'Do not rely on this curve: the power follows the pressure alone, and the whole range of '
+        f'the opening makes at most {plain(max(effect, 0.1), 2)} MW. Is this the pressure before '
+        'the valve, or one behind it?'
+    )
 
 
 def misfit_words(misfit: Misfit) -> str:
@@ -113,51 +133,71 @@ _NEAR = 0.02  # of the range of the power: rows at a load
 _LEAST_ROWS = 20
 
 
-def gain_by_load(data: Identified) -> list[tuple[float, float, float, float, float]]:
-    """Return load in MW, usual pressure in MPa, opening in %, MW per % of opening, 95 % error.
+class LoadGain(NamedTuple):
+    """The effect of the opening at a load.
 
-    Pressure and opening are medians of the special samples near the load.
+    ``load`` in MW, median ``pressure`` in MPa and ``opening`` in % of the rows near it, ``gain``
+    there in MW per % of opening with its 95 % ``error``, and its ``low`` and ``high`` over nine
+    of ten of these rows, whose pressures and openings differ.
     """
+
+    load: float
+    pressure: float
+    opening: float
+    gain: float
+    error: float
+    low: float
+    high: float
+
+
+def gain_by_load(data: Identified) -> list[LoadGain]:
+    """Return the effect of the opening at each load, from all rows."""
     c = data.characteristic
-    power, opening, pressure = (
-        data.table.column(signal)[data.special]
+    rows = np.column_stack([
+        data.table.column(signal)
         for signal in (
             Signal.GENERATED_POWER, Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE
         )
-    )  # fmt: skip
+    ])  # fmt: skip
+    power, opening, pressure = rows[np.isfinite(rows).all(axis=1)].T
     if not len(power):
         return []
+    slopes = np.array([piece.slope for piece in c.pieces])
+    per_percent = pressure ** (c.pressure_exponent + c.pressure_scale_exponent)
+    gains = slopes[piece_of(c, opening * pressure**c.pressure_exponent)] * per_percent
     low, high = np.quantile(power, (0.01, 0.99)).tolist()
     if not high > low:
         return []
     step = next((s for s in _LOADS if high - low > 4.0 * s), (high - low) / 4.0)
-    rows = []
+    found = []
     for load in np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step:
         near = np.abs(power - load) < _NEAR * (high - low)
-        if near.sum() < _LEAST_ROWS or not np.isfinite(pressure[near]).any():
+        if near.sum() < _LEAST_ROWS:
             continue
-        p, v = float(np.nanmedian(pressure[near])), float(np.nanmedian(opening[near]))
-        u = v * p**c.pressure_exponent
-        at = int(np.clip(np.searchsorted(c.breakpoints, u) - 1, 0, len(c.pieces) - 1))
-        per_percent = p ** (c.pressure_exponent + c.pressure_scale_exponent)
-        piece = c.pieces[at]
-        error = Z95 * piece.slope_stderr * per_percent
-        rows.append((float(load), p, v, piece.slope * per_percent, error))
-    return rows
+        p, v = float(np.median(pressure[near])), float(np.median(opening[near]))
+        piece = c.pieces[int(piece_of(c, np.array([v * p**c.pressure_exponent]))[0])]
+        scale = p ** (c.pressure_exponent + c.pressure_scale_exponent)
+        least, most = np.quantile(gains[near], (0.05, 0.95)).tolist()
+        found.append(LoadGain(
+            float(load), p, v, piece.slope * scale, Z95 * piece.slope_stderr * scale, least, most,
+        ))  # fmt: skip
+    return found
 
 
 def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of MW per % of opening by load."""
     unit = data.characteristic.output_unit
     head = [f'load ({unit})', 'usual pressure (MPa)', 'opening (%)',
-            f'{unit} per 1 % of opening', '95 % interval']  # fmt: skip
+            f'{unit} per 1 % of opening', '95 % interval', 'range at this load']  # fmt: skip
     cells = [
         [
-            decimals(load, 0 if load % 1.0 == 0.0 else 1), decimals(p, 1), decimals(v, 0),
-            plain(gain, 3),
-            f'{plain(gain - error, 3)} to {plain(gain + error, 3)}' if error > 0.0 else '-',
+            decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1), decimals(g.pressure, 1),
+            decimals(g.opening, 0), plain(g.gain, 3),
+            f'{plain(g.gain - g.error, 3)} to {plain(g.gain + g.error, 3)}'
+            if g.error > 0.0 else '-',
+            f'{plain(g.low, 3)} to {plain(g.high, 3)}',
         ]
-        for load, p, v, gain, error in gain_by_load(data)
+        for g in gain_by_load(data)
     ]  # fmt: skip
     return head, cells
 
@@ -165,7 +205,10 @@ def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
 def gain_table(data: Identified) -> str:
     """Return the table of MW per % of opening by load; empty without data for it."""
     head, cells = gain_cells(data)
-    caption = 'MW per 1 % of opening at each load, at the pressure that is usual at this load.'
+    caption = (
+        'MW per 1 % of opening at each load, at the pressure that is usual at this load. The '
+        'range is that of nine tenths of the time at this load, with other pressures and openings.'
+    )
     return table(head, cells, caption=caption) if cells else ''
 
 

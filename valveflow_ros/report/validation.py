@@ -102,8 +102,8 @@ def verdict_words(data: Validated) -> list[str]:
         _verdict(v),
         f'{counted(steady, "steady-state segment")} and '
         f'{counted(slope, "slope-response segment")} were judged; mean squared error '
-        f'{plain(j.mse(v.judged_by))} MW². In {worth} of {tested} segments the mean difference '
-        'is not significantly different from zero (one independent value per '
+        f'{plain(j.mse(v.judged_by))} MW². In {worth} of the {tested} segments that can be tested '
+        'the mean difference is within its error (one independent value per '
         f'{duration(j.widening * v.trial.step_s)}); in {each} if each sample is counted as '
         'independent, as the paper does.',
     ]
@@ -129,7 +129,7 @@ def verdict_words(data: Validated) -> list[str]:
 def _verdict(v: Validation) -> str:
     def differs(check: PieceCheck) -> str:
         return (
-            f'the power is {signed(check.test.mean, 2)} MW from what it predicts '
+            f'the measured power differs by {signed(check.test.mean, 2)} MW from what it predicts '
             f'({interval(check.low_mw, check.high_mw)} MW with 95 % confidence)'
         )
 
@@ -143,7 +143,7 @@ def _verdict(v: Validation) -> str:
     if v.misfit_beyond:
         return (
             f'The characteristic is off by {misfit_words(v.misfit_beyond)}; the tolerance '
-            f'is {tolerance}. The mean {mean}.'
+            f'is {tolerance}. On average, {mean}.'
         )
     if v.verdict is Verdict.OFF:
         off = [c for c in (v.overall, *v.pieces) if c.beyond(v.tolerance_mw)]

@@ -16,6 +16,7 @@ from valveflow_ros.cli.command import (
     checked_parameters,
     columns,
     lines,
+    log_of,
     mapping_of,
     write_results,
 )
@@ -65,8 +66,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     given = checked_parameters(options)
     truth = None if options.truth is None else load_truth(options.truth)
-    console(0.02, 'reading')
-    log = open_log(options.log, mapping, progress=console)
+    log = log_of(options, mapping, console)
     test = None if options.test is None else open_log(options.test, mapping, progress=console)
     found = compare(log, test=test, truth=truth, parameters=given, progress=console)
     console(0.95, 'writing the report')

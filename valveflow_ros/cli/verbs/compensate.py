@@ -17,8 +17,11 @@ from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.report.terminal.text import number, whole
 
 if TYPE_CHECKING:
+    from valveflow_ros.curve.characteristic import Characteristic
     from valveflow_ros.curve.compensation import Compensation
     from valveflow_ros.records import FloatArray
+
+_FAR = 0.25  # of the usual pressure
 
 _DESCRIPTION = """\
 Write the inverse of a flow characteristic as a table: the input u of the curve that gives a
@@ -92,7 +95,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         if len(pressures) > 1:
             raise UsageError(
                 'The breakpoints of this curve are at fixed openings, and at another power for '
-                'each pressure: make one table for each --pressure.'
+                'each pressure: make one table for each --pressure. A unit with sliding pressure '
+                'needs several, between which the controller interpolates by the pressure.'
             )
         if not pressures and math.isnan(curve.reference_pressure_mpa):
             raise UsageError(
@@ -111,7 +115,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
     made = make(options.points)
     _check(made, options.tolerance, make)
-    for sentence in made.notes[1:]:
+    for sentence in (*curve.notes, *_far(curve, pressures), *made.notes[1:]):
         console.warn(sentence)
     table = _table(made, pressures)
     _write(table, options.output)
@@ -124,6 +128,17 @@ def run(options: Namespace, console: Console) -> VerbResult:
     }
     data = _data(made, table, pressures, options.tolerance, options.output)
     return VerbResult(text, {**form, **data})
+
+
+def _far(curve: Characteristic, pressures: Sequence[float]) -> list[str]:
+    """Return a warning for each pressure that is far from that of the data."""
+    usual = curve.reference_pressure_mpa
+    return [
+        f'The usual pressure of the data was {usual:.1f} MPa. At {p:g} MPa the table rests on the '
+        'law of the pressure alone: do not use it where the unit did not run.'
+        for p in pressures
+        if abs(p - usual) > _FAR * usual
+    ]
 
 
 def _check(made: Compensation, tolerance_mw: float, again: Callable[[int], Compensation]) -> None:

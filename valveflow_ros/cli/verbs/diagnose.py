@@ -16,6 +16,7 @@ from valveflow_ros.cli.command import (
     checked_parameters,
     columns,
     lines,
+    log_of,
     mapping_of,
     write_results,
 )
@@ -65,7 +66,6 @@ def run(options: Namespace, console: Console) -> VerbResult:
     console(0.0, 'starting')
     from valveflow_ros.diagnosis.result import to_json
     from valveflow_ros.interface.diagnose import diagnose, load_diagnosable
-    from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.models import with_exponent
 
     given = checked_parameters(options)
@@ -73,8 +73,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     if options.model is not None:
         model = load_diagnosable(options.model)
         given = with_exponent(model, given, options.model)
-    console(0.02, 'reading')
-    log = open_log(options.log, mapping, progress=console)
+    log = log_of(options, mapping, console)
     found = diagnose(log, parameters=given, model=model, covariates=covariates, progress=console)
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), to_json(found.diagnosis))

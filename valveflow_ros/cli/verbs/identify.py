@@ -16,6 +16,7 @@ from valveflow_ros.cli.command import (
     checked_parameters,
     columns,
     lines,
+    log_of,
     mapping_of,
     rejected_words,
     write_results,
@@ -71,7 +72,6 @@ def run(options: Namespace, console: Console) -> VerbResult:
     mapping = mapping_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.identify import identify
-    from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.models import (
         load_characteristic,
         load_extended,
@@ -88,8 +88,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
             raise UsageError('--step-test and --model do not go together.')
         model = load_extended(path)
         given = with_exponent(model, given, path)
-    console(0.02, 'reading')
-    log = open_log(options.log, mapping, progress=console)
+    log = log_of(options, mapping, console)
     found = identify(
         log, parameters=given, model=model, reference=reference, step_test=options.step_test,
         progress=console,

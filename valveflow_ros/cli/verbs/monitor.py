@@ -16,6 +16,7 @@ from valveflow_ros.cli.command import (
     checked_parameters,
     columns,
     lines,
+    log_of,
     mapping_of,
     write_results,
 )
@@ -63,12 +64,10 @@ def run(options: Namespace, console: Console) -> VerbResult:
     """Open the log, run the monitor, write."""
     mapping = mapping_of(options)
     console(0.0, 'starting')
-    from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.monitor import monitor
 
     given = checked_parameters(options)
-    console(0.02, 'reading')
-    log = open_log(options.log, mapping, progress=console)
+    log = log_of(options, mapping, console)
     found = monitor(
         log, parameters=given, model=options.model, reference=options.reference,
         diagnose=not options.no_diagnosis, progress=console,

@@ -16,6 +16,7 @@ from valveflow_ros.cli.command import (
     checked_parameters,
     columns,
     lines,
+    log_of,
     mapping_of,
     write_results,
 )
@@ -60,13 +61,11 @@ def run(options: Namespace, console: Console) -> VerbResult:
     mapping = mapping_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.compare import check_models, validate
-    from valveflow_ros.interface.logs import open_log
     from valveflow_ros.report.validation import verdict_words
 
     given = checked_parameters(options)
     check_models(options.model, options.against, given)
-    console(0.02, 'reading')
-    log = open_log(options.log, mapping, progress=console)
+    log = log_of(options, mapping, console)
     found = validate(
         log, options.model, against=options.against, tolerance_mw=options.tolerance,
         parameters=given, progress=console,

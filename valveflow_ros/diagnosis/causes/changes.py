@@ -133,7 +133,8 @@ def gain_step_sentence(values: SentenceValues) -> str:
     """Return the sentence for the operator."""
     return (
         f'From {values.onset} the same flow gives {change(values["g"])} power, at every '
-        'load alike (maintenance, power meter, a heater or extraction).'
+        'load alike (maintenance, power meter, a heater or extraction). A change of the flow by '
+        'the same share at every load would look the same.'
     )
 
 

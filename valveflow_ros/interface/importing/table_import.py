@@ -271,11 +271,11 @@ class TableImport:
             refused.append(error)
         self._time_ns = np.concatenate(times)
         notes += self._sort()
-        for name in self._used:
+        for note in filter(None, notes):
+            self._progress.say(note)
+        for name in self._used:  # the result says them
             notes.append(air_note(_BY_COLUMN[name].signal, self._units[name], reader.names[name]))
         notes = [note for note in notes if note]
-        for note in notes:
-            self._progress.say(note)
         if all(np.isnan(found.low) for found in self._statistics.values()):
             raise DataError(f'{reader.path}: there is no number in any of the columns used.')
         self._judge(refused)

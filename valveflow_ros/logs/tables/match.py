@@ -49,6 +49,7 @@ _LOCAL = {
     **dict.fromkeys(('PST', 'PDT'), 'America/Los_Angeles'),
 }  # fmt: skip
 _PERIOD = '60s'
+_USUAL_DEGC = 540
 _GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its tag'}
 
 
@@ -205,7 +206,7 @@ class Matcher:
                 f'yours with {options}{constant if missing else ""}{apart}'
             )
         return RefusedError(
-            self.path, '; '.join(parts), [*remedies, *(choosing(t, THEIRS) for t in topics)]
+            self.path, '; '.join(parts), [*remedies, *(_naming(t) for t in topics)]
         )
 
     def missing(self, theirs: str, name: str) -> RefusedError:
@@ -248,6 +249,13 @@ class Matcher:
 def option(topic: str, theirs: str, unit: str = '') -> str:
     """Return the option that selects a column, quoted for a shell."""
     return str(choosing(topic, theirs, unit))
+
+
+def _naming(topic: str) -> Remedy:
+    """Return the option for a signal that was not found; the temperature is often not recorded."""
+    if topic == SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic:
+        return Remedy('constant', f'{topic}={_USUAL_DEGC}')
+    return choosing(topic, THEIRS)
 
 
 def choosing(topic: str, theirs: str, unit: str = '') -> Remedy:
