@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import tzinfo
 from typing import Any
 
-from valveflow_ros.errors import InputError, ParameterError
+from valveflow_ros.errors import InputError, ParameterError, UsageError
 from valveflow_ros.records import FLOW_UNITS, zone_of
 
 Value = bool | int | float | str
@@ -512,6 +512,25 @@ def parameter(name: str) -> Parameter:
         hint = f"; did you mean '{near[0]}'?" if near else ''
         raise ParameterError(name, f'does not exist{hint}')
     return row
+
+
+def covariate_columns(said: Iterable[str], where: str = '--covariate') -> dict[str, str]:
+    """Return ``COLUMN`` or ``COLUMN:UNIT`` of texts ``NAME=COLUMN[:UNIT]``, by name.
+
+    Raises
+    ------
+    UsageError
+        A text has another form, or a name is given twice. The message begins with ``where``.
+    """
+    found: dict[str, str] = {}
+    for text in said:
+        name, equals, theirs = (part.strip() for part in text.partition('='))
+        if not equals or not name or not theirs:
+            raise UsageError(f"{where} '{text}' is not of the form NAME=COLUMN[:UNIT].")
+        if name in found:
+            raise UsageError(f'{where} {name} is given twice.')
+        found[name] = theirs
+    return found
 
 
 def _check_zone(name: str) -> None:

@@ -13,8 +13,10 @@ from valveflow_ros.cli.command import (
     VerbResult,
     add_analysis,
     add_analysis_options,
+    add_covariate,
     checked_parameters,
     columns,
+    covariates_of,
     lines,
     mapping_of,
     write_results,
@@ -36,7 +38,10 @@ and quicker, without the diagnoses:
 
 and quickest, by a curve that is there already, without a fit:
   valveflow monitor plant.mcap -o result --reference health/characteristic.json \\
-      --no-diagnosis --set refit_period=0 --set refit_segments=0 --set alarm_on_delay=600"""
+      --no-diagnosis --set refit_period=0 --set refit_segments=0 --set alarm_on_delay=600
+
+with the condenser pressure, which the diagnoses try as a cause:
+  valveflow monitor plant.csv -o result --covariate vacuum=condenser_pressure_kpa"""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -56,12 +61,14 @@ def arguments(parser: ArgumentParser) -> None:
         '--no-diagnosis', action='store_true',
         help='leave out the diagnoses, each of which takes as long as `valveflow diagnose`',
     )  # fmt: skip
+    add_covariate(parser)
     add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
     """Open the log, run the monitor, write."""
     mapping = mapping_of(options)
+    covariates = covariates_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.monitor import monitor
@@ -71,7 +78,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     log = open_log(options.log, mapping, progress=console)
     found = monitor(
         log, parameters=given, model=options.model, reference=options.reference,
-        diagnose=not options.no_diagnosis, progress=console,
+        diagnose=not options.no_diagnosis, covariates=covariates, progress=console,
     )  # fmt: skip
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), found.to_json())
