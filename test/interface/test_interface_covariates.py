@@ -205,3 +205,9 @@ def test_what_is_no_covariate_is_refused(plant, said, sentence):
     if 'few' not in said:  # the monitor leaves it out of a diagnosis, and says so
         with pytest.raises(InputError, match=sentence):
             vf.monitor(frame, covariates=said)
+
+
+def test_the_parameter_is_used_where_no_covariate_is_given(plant):
+    given = {'covariates': 'vacuum=nowhere'}
+    with pytest.raises(InputError, match='--covariate vacuum: DataFrame has no column'):
+        vf.monitor(plant.to_dataframe().head(1500), parameters=given)

@@ -44,7 +44,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import Wear
-from valveflow_ros.parameters import Settings
+from valveflow_ros.parameters import Settings, covariate_columns
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import (
@@ -419,7 +419,8 @@ def monitor(
     diagnose : bool
         Also compute the diagnoses that the monitor requests; each takes as long as `diagnose`.
     covariates : mapping of str to str, optional
-        Further columns that the diagnoses try as causes, given as in `diagnose`.
+        Further columns that the diagnoses try as causes, given as in `diagnose`; by default
+        the topics in the parameter ``covariates``.
     progress : Progress
 
     Raises
@@ -439,14 +440,16 @@ def monitor(
     if reference is not None and not isinstance(reference, Characteristic):
         reference = load_characteristic(reference)
     log = as_log(log, progress)
-    check_covariates(covariates or {})
+    if covariates is None:
+        covariates = covariate_columns(str(given.get('covariates', '')).split())
+    check_covariates(covariates)
     # The window is as long as that of a live monitor, independent of the length of the log.
     given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
     for sentence in (*told, *notes):
         progress.say(sentence)
     corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
-    series = {name: read_covariate(log, name, said) for name, said in (covariates or {}).items()}
+    series = {name: read_covariate(log, name, said) for name, said in covariates.items()}
     entries = tuple(entry(name, s.column, s.unit) for name, s in series.items())
     aligner, engine = Aligner(settings), Monitor(settings, corrector, entries)
     events: list[Event] = [] if reference is None else engine.set_reference(reference)

@@ -78,7 +78,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     log = open_log(options.log, mapping, progress=console)
     found = monitor(
         log, parameters=given, model=options.model, reference=options.reference,
-        diagnose=not options.no_diagnosis, covariates=covariates, progress=console,
+        diagnose=not options.no_diagnosis, covariates=covariates or None, progress=console,
     )  # fmt: skip
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), found.to_json())
