@@ -15,7 +15,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent / 'valveflow_ros'
 _NODE = _PACKAGE / 'ros' / 'node'
 
 _ABOUT = {
-    'input …': 'one for each signal: is it there, in time, believable, complete',
+    'input …': 'one for each signal and covariate: is it there, in time, believable, complete',
     'fit': 'is there a curve, is it renewed, what does it lack',
     'model': 'does the model still fit the plant',
     'diagnosis': 'what the last diagnosis said, and whether one is running',

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import tzinfo
 from typing import Any
 
-from valveflow_ros.errors import InputError, ParameterError
+from valveflow_ros.errors import InputError, ParameterError, UsageError
 from valveflow_ros.records import FLOW_UNITS, zone_of
 
 Value = bool | int | float | str
@@ -186,6 +186,12 @@ _UNIT_AND_INPUTS = (
     Parameter(
         'valve_command_unit', 'percent', '', 'Unit the gateway sends valve_command in.',
         choices=_OPENING_UNITS,
+    ),
+    Parameter(
+        'covariates', '', '',
+        'Further topics (std_msgs/Float64) that the power may follow and that a diagnosis tries '
+        'as causes: NAME=TOPIC[:UNIT], separated by blanks, such as '
+        'vacuum=/condenser/pressure:kPa; at most ten.',
     ),
 )  # fmt: skip
 
@@ -380,6 +386,7 @@ _RECORD = (
 )  # fmt: skip
 
 _MOST_ROWS = 20_000_000  # about 0.8 GB of window
+_MOST_COVARIATES = 10  # each needs as much memory as one of the five signals
 
 TABLE: tuple[Parameter, ...] = (
     *_UNIT_AND_INPUTS,
@@ -514,6 +521,34 @@ def parameter(name: str) -> Parameter:
     return row
 
 
+def covariate_columns(said: Iterable[str], where: str = '--covariate') -> dict[str, str]:
+    """Return ``COLUMN`` or ``COLUMN:UNIT`` of texts ``NAME=COLUMN[:UNIT]``, by name.
+
+    Raises
+    ------
+    UsageError
+        A text has another form, or a name is given twice. The message begins with ``where``.
+    """
+    found: dict[str, str] = {}
+    for text in said:
+        name, equals, theirs = (part.strip() for part in text.partition('='))
+        if not equals or not name or not theirs:
+            raise UsageError(f"{where} '{text}' is not of the form NAME=COLUMN[:UNIT].")
+        if name in found:
+            raise UsageError(f'{where} {name} is given twice.')
+        found[name] = theirs
+    return found
+
+
+def _check_covariates(text: str) -> None:
+    try:
+        count = len(covariate_columns(text.split(), 'entry'))
+    except UsageError as error:
+        raise ParameterError('covariates', f'cannot be used: {str(error).rstrip(".")}') from None
+    if count > _MOST_COVARIATES:
+        raise ParameterError('covariates', f'has {count} entries, at most {_MOST_COVARIATES}')
+
+
 def _check_zone(name: str) -> None:
     try:
         zone_of(name)
@@ -525,6 +560,7 @@ def _check_zone(name: str) -> None:
 def _check_together(values: Mapping[str, Value]) -> None:
     """Raise `ParameterError` if valid values contradict each other."""
     _check_zone(str(values['time_zone']))
+    _check_covariates(str(values['covariates']))
     for signal in ('valve_opening', 'main_steam_pressure', 'main_steam_temperature',
                    'generated_power'):  # fmt: skip
         low, high = float(values[f'{signal}_low']), float(values[f'{signal}_high'])

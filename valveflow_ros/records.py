@@ -148,11 +148,15 @@ class SampleTable:
         Columns in the order of `Signal`, engine units; NaN if there is no usable value.
     quality : uint8 (n, 5)
         A `Quality` per value; `BAD` if and only if the value is NaN.
+    covariates : float64 (n, k) or None
+        Values of further columns in the order in which the user named them, NaN if there is none;
+        None without such columns.
     """
 
     time_ns: IntArray
     values: FloatArray
     quality: ByteArray
+    covariates: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -165,11 +169,13 @@ class SampleTable:
     def part(self, start: int, end: int) -> SampleTable:
         """Return the rows ``[start, end)`` without copying."""
         cut = slice(start, end)
-        return SampleTable(self.time_ns[cut], self.values[cut], self.quality[cut])
+        beside = None if self.covariates is None else self.covariates[cut]
+        return SampleTable(self.time_ns[cut], self.values[cut], self.quality[cut], beside)
 
     def take(self, rows: IntArray) -> SampleTable:
         """Return copies of some rows."""
-        return SampleTable(self.time_ns[rows], self.values[rows], self.quality[rows])
+        beside = None if self.covariates is None else self.covariates[rows]
+        return SampleTable(self.time_ns[rows], self.values[rows], self.quality[rows], beside)
 
     @classmethod
     def from_columns(
@@ -196,10 +202,12 @@ class SampleTable:
         """Join consecutive tables."""
         if not tables:
             return cls.from_columns(np.empty(0, dtype=np.int64), {})
+        beside = [t.covariates for t in tables if t.covariates is not None]
         return cls(
             np.concatenate([t.time_ns for t in tables]),
             np.concatenate([t.values for t in tables]),
             np.concatenate([t.quality for t in tables]),
+            np.concatenate(beside) if beside else None,
         )
 
 

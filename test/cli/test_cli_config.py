@@ -133,3 +133,10 @@ def test_a_column_s_name_cannot_write_parameters(run, tmp_path):
     assert yaml.safe_load(ran.out)['/**']['ros__parameters']['unit_tag'] != 'OWNED'
     ran = run('config', 'init', *tmp_path.glob('*.parquet'), '-o', tmp_path / 'x.yaml')
     assert not any(line.startswith('    unit_tag') for line in ran.out.splitlines())
+
+
+def test_a_covariate_with_the_name_of_a_cause_is_refused(run, tmp_path):
+    file = tmp_path / 'monitor.yaml'
+    file.write_text("/**:\n  ros__parameters:\n    covariates: 'backlash=/x'\n")
+    refusal = run('config', 'check', file).refused()
+    assert f"{file}: Parameter 'covariates' cannot be used: entry 'backlash' is a" in refusal

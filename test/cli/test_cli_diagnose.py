@@ -87,8 +87,9 @@ def test_the_page_tells_four_steps(diagnosed):
         (['vacuum=nowhere'], "--covariate vacuum: plant.parquet has no column or topic 'nowhere'"),
     ],
 )
-def test_a_covariate_that_cannot_be_read_is_refused(diagnosed, capsys, said, sentence):
+@pytest.mark.parametrize('verb', ['diagnose', 'monitor'])
+def test_a_covariate_that_cannot_be_read_is_refused(diagnosed, capsys, said, sentence, verb):
     words = [word for one in said for word in ('--covariate', one)]
     log, out = str(diagnosed / 'plant.parquet'), str(diagnosed / 'refused')
-    assert main(['diagnose', log, '-o', out, '--quiet', *words]) != 0
+    assert main([verb, log, '-o', out, '--quiet', *words]) != 0
     assert sentence in capsys.readouterr().err

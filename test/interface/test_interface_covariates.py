@@ -145,6 +145,39 @@ def test_it_is_the_same_from_a_file(plant, tmp_path, kind):
     np.testing.assert_array_equal(from_file.values, from_frame.values)
 
 
+# The monitor diagnoses twice: after the first day, and one day later.
+NIGHTLY = {
+    'reference_after': 0.0, 'diagnosis_on_mismatch': False, 'refit_period': 86400.0,
+    'refit_segments': 0,
+}  # fmt: skip
+
+
+def monitored(plant, covariates):
+    """Return the last diagnosis of a monitor over two and a half days."""
+    frame = plant.to_dataframe().head(3600)
+    few = frame[COLUMN].where(np.arange(len(frame)) < 600)
+    result = vf.monitor(frame.assign(few=few), parameters=NIGHTLY, covariates=covariates)
+    return result.diagnoses[-1][1]
+
+
+@needs_jit
+def test_the_monitor_names_it_with_its_size(plant):
+    found = monitored(plant, {'vacuum': COLUMN, 'short': 'few'})
+    (cause,) = found['causes']
+    b = cause['parameters']['b']
+    assert (cause['name'], b['unit']) == ('vacuum', 'MW/kPa')
+    assert b['low'] <= truth(plant) <= b['high']
+    assert b['high'] - b['low'] < 0.2 * abs(truth(plant))
+    (note,) = (note for note in found['notes'] if 'few' in note)
+    assert note.startswith("'few' has values for only ")
+    assert note.endswith('half of them are needed. short was left out.')
+
+
+@needs_jit
+def test_without_the_column_the_monitor_does_not_name_it(plant):
+    assert 'vacuum' not in {cause['name'] for cause in monitored(plant, None)['causes']}
+
+
 def test_series_are_bridged_but_not_over_gaps():
     minute = 60 * 10**9
     times = np.array([0, 1, 2, 200, 201]) * minute
@@ -169,3 +202,12 @@ def test_what_is_no_covariate_is_refused(plant, said, sentence):
     frame['few'] = pd.Series(np.where(np.arange(1500) < 300, 1.0, np.nan))
     with pytest.raises(InputError, match=sentence):
         vf.diagnose(frame, covariates=said)
+    if 'few' not in said:  # the monitor leaves it out of a diagnosis, and says so
+        with pytest.raises(InputError, match=sentence):
+            vf.monitor(frame, covariates=said)
+
+
+def test_the_parameter_is_used_where_no_covariate_is_given(plant):
+    given = {'covariates': 'vacuum=nowhere'}
+    with pytest.raises(InputError, match='--covariate vacuum: DataFrame has no column'):
+        vf.monitor(plant.to_dataframe().head(1500), parameters=given)

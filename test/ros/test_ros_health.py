@@ -228,6 +228,20 @@ def test_a_command_that_was_never_sent_is_no_warning(stamped: bool) -> None:
     scene.says(Level.STALE, 'has been silent', 'valve_command', at=NOW + 60.0)
 
 
+def test_a_silent_covariate_is_told_without_a_warning() -> None:
+    scene, name, topic = Scene(), 'covariate vacuum', '/condenser/pressure'
+    scene.health = InputHealth(Settings(), {name: topic, **TOPICS})
+    scene.statistics[name] = TopicStatistics()
+    scene.says(Level.OK, f'{topic} is not sent; it is optional.', name)
+    scene.hear(name)
+    scene.says(Level.OK, '1 Hz.', name)
+    scene.says(Level.OK, f'{topic} has been silent for 60.0 s; it is optional.', name, at=NOW + 60)
+    assert scene.item(name, at=NOW + 60).values['Age of the newest message (s)'] == 60.0
+    scene.health.note(name, [(1, len(SIGNALS), 5.0, 0)])
+    scene.publishers[name] = Publishers(0, ('std_msgs/msg/Float32',))
+    scene.says(Level.ERROR, 'which the monitor cannot take', name)
+
+
 def test_a_stamped_sample_of_the_wrong_type_is_seen_before_it_is_heard() -> None:
     scene = Scene()
     scene.statistics = {name: TopicStatistics() for name in TOPICS}

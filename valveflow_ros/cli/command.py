@@ -325,6 +325,22 @@ def log_of(options: Namespace, mapping: LogMapping, console: Console) -> Log:
     return open_log(options.log, mapping, progress=console).between(start, end)
 
 
+def add_covariate(parser: ArgumentParser) -> None:
+    """Add the option for columns that a diagnosis tries as causes."""
+    parser.add_argument(
+        '--covariate', action='append', default=[], metavar='NAME=COLUMN[:UNIT]',
+        help='a column beside the signals that the power may follow, such as '
+        'vacuum=condenser_pressure_kpa; may be given several times',
+    )  # fmt: skip
+
+
+def covariates_of(options: Namespace) -> dict[str, str]:
+    """Return the columns of these options by name; raises `UsageError`."""
+    from valveflow_ros.parameters import covariate_columns
+
+    return covariate_columns(options.covariate)
+
+
 def checked_parameters(options: Namespace) -> dict[str, Any]:
     """Return the parameters set by the user; raise early if the results could not be written.
 

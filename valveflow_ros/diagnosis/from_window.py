@@ -15,6 +15,7 @@ from valveflow_ros.diagnosis.cause import Stage
 from valveflow_ros.diagnosis.causes import catalogue
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.extended import ExtendedModel
+from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
 from valveflow_ros.diagnosis.result import to_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.problem import Samples
@@ -22,6 +23,7 @@ from valveflow_ros.fit.refine import refine
 from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask
 from valveflow_ros.records import FloatArray, IntArray, Quality, SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.covariates import parts
 from valveflow_ros.signals.static_form import StaticForm, pressure_of
 
 # An initial model if the special segments give none.
@@ -141,7 +143,8 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
     Notes
     -----
     The diagnosis starts from the current curve. The dynamics and the number of pieces are fitted
-    to the window, as in `valveflow diagnose` without a model.
+    to the window, as in `valveflow diagnose` without a model. A covariate with values for less
+    than half of the rows is left out, which a note says.
     """
     settings, contents = task.settings, task.contents
     form, step_s = task.curve.static_form, settings.real('sample_period')
@@ -149,9 +152,17 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
     model: RegionalModel = task.curve.model
     if not task.curve.dynamics:
         model = first_model(table, step_s, form, settings.settle_s)
-    record = Record(table, step_s, form, settings.settle_s, _spans_ns(contents))
+    beside = [CovariateRows(*parts(entry), rows) for entry, rows in contents.covariates.items()]
+    short = {c.name: c for c in beside if c.covered < LEAST_COVERED}
+    record = Record(
+        table, step_s, form, settings.settle_s, _spans_ns(contents),
+        covariates=tuple(c for c in beside if c.name not in short),
+    )  # fmt: skip
     record = without_causes(record, task.curve.held)
-    text = json.dumps(to_json(diagnose(record, model)), allow_nan=False)
+    found = diagnose(record, model)
+    left_out = (f'{c.few} {c.name} was left out.' for c in short.values())
+    found = replace(found, notes=(*found.notes, *left_out))
+    text = json.dumps(to_json(found), allow_nan=False)
     return DiagnosisContent(task.window_end_ns, text)
 
 

@@ -138,6 +138,22 @@ class CovariateRows:
     unit: str
     values: FloatArray
 
+    @property
+    def covered(self) -> float:
+        """Return the share of the rows with a value."""
+        return float(np.isfinite(self.values).mean())
+
+    @property
+    def few(self) -> str:
+        """Return a sentence on the rows that have a value."""
+        return (
+            f"'{self.column}' has values for only {100.0 * self.covered:.0f} % of the rows; half "
+            'of them are needed.'
+        )
+
+
+LEAST_COVERED = 0.5  # of the rows must have a value of a covariate
+
 
 @dataclass(frozen=True, slots=True)
 class Grids:

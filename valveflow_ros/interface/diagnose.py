@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +15,11 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
-from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes import check_covariates
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
-from valveflow_ros.diagnosis.grids import CovariateRows
+from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
 from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
 from valveflow_ros.errors import DataError, InputError
@@ -232,19 +231,6 @@ def diagnose(
     return DiagnosisResult(data, form, earlier)
 
 
-def check_covariates(said: Mapping[str, str]) -> None:
-    """Raise `InputError` if the name of a covariate is invalid or already has another meaning."""
-    for name in said:
-        if not _NAME.fullmatch(name):
-            raise InputError(
-                f"--covariate '{name}': a name has letters, digits and underscores, at most 40."
-            )
-        if name in catalogue():
-            raise InputError(
-                f"--covariate '{name}' is a cause of the catalogue already; choose another name."
-            )
-
-
 def covariate_rows(
     log: Log, said: Mapping[str, str], table: SampleTable
 ) -> tuple[CovariateRows, ...]:
@@ -258,19 +244,11 @@ def covariate_rows(
     found = []
     for name, theirs in said.items():
         series = read_covariate(log, name, theirs)
-        values = series.at(table.time_ns)
-        share = float(np.isfinite(values).mean())
-        if share < _LEAST_SHARE:
-            raise InputError(
-                f"--covariate {name}: '{series.column}' has values for only {100.0 * share:.0f} % "
-                'of the rows; half of them are needed.'
-            )
-        found.append(CovariateRows(name, series.column, series.unit, values))
+        rows = CovariateRows(name, series.column, series.unit, series.at(table.time_ns))
+        if rows.covered < LEAST_COVERED:
+            raise InputError(f'--covariate {name}: {rows.few}')
+        found.append(rows)
     return tuple(found)
-
-
-_NAME = re.compile(r'[A-Za-z]\w{0,39}', re.ASCII)
-_LEAST_SHARE = 0.5
 
 
 def _rows(

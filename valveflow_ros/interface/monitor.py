@@ -8,7 +8,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,14 @@ import numpy as np
 from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import minute
+from valveflow_ros.diagnosis.causes import check_covariates
 from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import Result
-from valveflow_ros.interface.logs import Log, as_log
+from valveflow_ros.interface.logs import Log, as_log, read_covariate
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
 from valveflow_ros.interface.observation import check_signals
 from valveflow_ros.interface.settings import settings_for
@@ -43,7 +44,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import Wear
-from valveflow_ros.parameters import Settings
+from valveflow_ros.parameters import Settings, covariate_columns
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable
 from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import (
@@ -72,6 +73,7 @@ from valveflow_ros.report.words import (
     signed,
 )
 from valveflow_ros.signals.align import Aligner, aligned_blocks
+from valveflow_ros.signals.covariates import entry, held
 
 # Switches the diagnoses off: each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
@@ -398,6 +400,7 @@ def monitor(
     model: ExtendedModel | str | Path | None = None,
     reference: Characteristic | str | Path | None = None,
     diagnose: bool = True,
+    covariates: Mapping[str, str] | None = None,
     progress: Progress = SILENT,
 ) -> MonitorResult:
     """Run the monitor over a log as fast as possible; each fit is computed in this process.
@@ -415,6 +418,9 @@ def monitor(
         Every curve is compared with it, like the parameter ``reference_file`` of the node.
     diagnose : bool
         Also compute the diagnoses that the monitor requests; each takes as long as `diagnose`.
+    covariates : mapping of str to str, optional
+        Further columns that the diagnoses try as causes, given as in `diagnose`; by default
+        the topics in the parameter ``covariates``.
     progress : Progress
 
     Raises
@@ -435,18 +441,28 @@ def monitor(
     if reference is not None and not isinstance(reference, Characteristic):
         reference = load_characteristic(reference)
     log = as_log(log, progress)
+    if covariates is None:
+        covariates = covariate_columns(str(given.get('covariates', '')).split())
+    check_covariates(covariates)
     # The window is as long as that of a live monitor, independent of the length of the log.
     given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
     for sentence in (*told, *notes):
         progress.say(sentence)
     corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
-    aligner, engine = Aligner(settings), Monitor(settings, corrector)
+    series = {name: read_covariate(log, name, said) for name, said in covariates.items()}
+    entries = tuple(entry(name, s.column, s.unit) for name, s in series.items())
+    aligner, engine = Aligner(settings), Monitor(settings, corrector, entries)
     events: list[Event] = [] if reference is None else engine.set_reference(reference)
     tables: list[SampleTable] = []
     tell = _progress_by_time(log, progress)
     for aligned in aligned_blocks(aligner, log.readings, None, ''):
         tables.append(aligned.table)
+        if series:
+            rows_ns = aligned.table.time_ns
+            beside = [held(s.time_ns, s.values, rows_ns) for s in series.values()]
+            table = replace(aligned.table, covariates=np.column_stack(beside))
+            aligned = replace(aligned, table=table)
         events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text, tell)
         if len(aligned.table):
             tell(int(aligned.table.time_ns[-1]), '')

@@ -13,7 +13,7 @@ import yaml
 
 from valveflow_ros.errors import InputError, ParameterError, RecordingError, UsageError
 from valveflow_ros.interface.files import reason
-from valveflow_ros.parameters import PARAMETERS, Settings, parameter
+from valveflow_ros.parameters import PARAMETERS, Settings, covariate_columns, parameter
 from valveflow_ros.records import Signal
 
 _ROUND_S = (1.0, 2.0, 5.0, 6.0, 10.0, 12.0, 15.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0,
@@ -117,6 +117,16 @@ def read_parameters(
         except ParameterError as error:
             raise UsageError(str(error)) from None
     return given
+
+
+def check_names(settings: Settings) -> None:
+    """Raise `ParameterError` if a name in the parameter ``covariates`` cannot be used."""
+    from valveflow_ros.diagnosis.causes import check_covariates
+
+    try:
+        check_covariates(covariate_columns(settings.text('covariates').split()), 'entry')
+    except InputError as error:
+        raise ParameterError('covariates', f'cannot be used: {str(error).rstrip(".")}') from None
 
 
 def _value(name: str, text: str) -> object:

@@ -322,8 +322,9 @@ class DiagnosisRequests:
         self._named_ns = max(time_ns, self._named_ns + 1)
         self._asked_ns, self._wanted = time_ns, ''
         task = DiagnosisTask(
-            self._named_ns, window.contents(since_ns), self.settings, curve, time_ns
-        )
+            self._named_ns, window.contents(since_ns, covariates=True), self.settings, curve,
+            time_ns,
+        )  # fmt: skip
         self._pending = task.without_data()
         entry = self._journal(JournalKind.DIAGNOSE, task.request_ns, curve.model_id, reason)
         return [entry, DiagnosisRequested(task)]

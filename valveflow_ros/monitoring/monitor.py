@@ -58,6 +58,9 @@ class Monitor(Memory):
     settings : Settings
     corrector : Corrector, optional
         Removes known causes from the rows before they are used.
+    covariates : tuple of str
+        Entries of the columns in `SampleTable.covariates`, which the diagnoses try as causes;
+        see `signals.covariates`.
 
     Notes
     -----
@@ -74,11 +77,16 @@ class Monitor(Memory):
         '_chart_not_ns',
     )  # fmt: skip
 
-    def __init__(self, settings: Settings, corrector: Corrector | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        corrector: Corrector | None = None,
+        covariates: tuple[str, ...] = (),
+    ) -> None:
         self.settings = settings
         self._correction = Correction(corrector)
         self._segmenter = Segmenter(settings)
-        self._window = RollingWindow.of(settings)
+        self._window = RollingWindow.of(settings, covariates)
         self.alarm = ResidualAlarm(settings)
         self._force = RunningCurve(settings)
         self._rows = 0
@@ -387,7 +395,7 @@ class Monitor(Memory):
             self.reference.go_back(int(rows.time_ns[0]))
         self._window.append(
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, rows.opening_percent,
-            rows.command_percent,
+            rows.command_percent, rows.covariates,
         )  # fmt: skip
         block = self._force.predict(rows, segmented.kinds)
         self.diagnosing.watch(block, rows.temperature_degc, self.predicting)

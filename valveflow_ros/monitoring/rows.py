@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -150,7 +150,7 @@ class Fed:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """The columns of some rows, all of shape (n,)."""
+    """The columns of some rows, all of shape (n,); covariates (n, k), or None without them."""
 
     time_ns: IntArray
     u: FloatArray
@@ -158,6 +158,7 @@ class Rows:
     temperature_degc: FloatArray
     opening_percent: FloatArray
     command_percent: FloatArray
+    covariates: FloatArray | None = None
 
     def part(self, start: int, end: int) -> Rows:
         """Return the rows ``[start, end)`` without copying."""
@@ -169,6 +170,7 @@ class Rows:
             self.temperature_degc[cut],
             self.opening_percent[cut],
             self.command_percent[cut],
+            None if self.covariates is None else self.covariates[cut],
         )
 
     @classmethod
@@ -176,7 +178,10 @@ class Rows:
         """Return the columns that the engine uses, including u of eq. (1)."""
         if correction is not None and correction.on:
             measured = np.ascontiguousarray(table.column(Signal.GENERATED_POWER))
-            return CorrectedRows(cls.of(correction.rows(table), exponent), measured)
+            return CorrectedRows(
+                cls.of(replace(correction.rows(table), covariates=table.covariates), exponent),
+                measured,
+            )
         opening = np.ascontiguousarray(table.column(Signal.VALVE_OPENING))
         u = integrated_input(
             opening,
@@ -186,7 +191,7 @@ class Rows:
         power = np.ascontiguousarray(table.column(Signal.GENERATED_POWER))
         temperature = np.ascontiguousarray(table.column(Signal.MAIN_STEAM_TEMPERATURE))
         command = np.ascontiguousarray(table.column(Signal.VALVE_COMMAND))
-        return cls(table.time_ns, u, power, temperature, opening, command)
+        return cls(table.time_ns, u, power, temperature, opening, command, table.covariates)
 
     def shown(self, block: PredictionBlock) -> PredictionBlock:
         """Return the predictions of these rows for the measured power."""
@@ -208,7 +213,7 @@ class CorrectedRows(Rows):
     def __init__(self, rows: Rows, measured_mw: FloatArray) -> None:
         Rows.__init__(
             self, rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc,
-            rows.opening_percent, rows.command_percent,
+            rows.opening_percent, rows.command_percent, rows.covariates,
         )  # fmt: skip
         object.__setattr__(self, 'measured_mw', measured_mw)
 

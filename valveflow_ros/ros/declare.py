@@ -12,6 +12,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from valveflow_ros.errors import ParameterError, listed
+from valveflow_ros.interface.settings import check_names
+from valveflow_ros.logs.names import last_part
 from valveflow_ros.parameters import (
     NOT_NOW,
     PARAMETERS,
@@ -21,6 +23,7 @@ from valveflow_ros.parameters import (
     Value,
     parameter,
 )
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, inputs_of
 
 # Parameters that ROS itself adds to every node.
 _SIM_TIME = 'use_sim_time'
@@ -150,6 +153,31 @@ def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list
                 name, f'must be a whole number from 1 to {_DEEPEST}, not {value!r}'
             )
     return sentences
+
+
+def inputs(node: Node, settings: Settings) -> dict[str, str]:
+    """Return the full name of each topic to which the monitor subscribes, by name of the input.
+
+    Raises
+    ------
+    ParameterError
+        If a covariate has a name or a topic that cannot be used.
+    """
+    check_names(settings)
+    found: dict[str, str] = {}
+    for topic in reversed(inputs_of(settings)):
+        own = topic.name in INPUT_BY_NAME
+        try:
+            full_name = node.resolve_topic_name(topic.topic)
+        except RuntimeError:
+            why = f"entry '{topic.topic}' is no name of a topic"
+            raise ParameterError('covariates', f'cannot be used: {why}') from None
+        # A log is read by the last part of a topic's name.
+        if not own and (full_name in found.values() or last_part(full_name) in INPUT_BY_NAME):
+            why = f"entry '{topic.topic}' is the topic of another input"
+            raise ParameterError('covariates', f'cannot be used: {why}')
+        found[topic.name] = full_name
+    return dict(reversed(found.items()))
 
 
 def changed(settings: Settings, wanted: Iterable[RosParameter], *, running: bool) -> Settings:

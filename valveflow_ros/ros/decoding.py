@@ -18,7 +18,8 @@ from valveflow_msgs.msg import PlantSample
 from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
+from valveflow_ros.records import N_SIGNALS, NS_PER_S, SIGNALS, Quality, Signal
+from valveflow_ros.signals.covariates import entries_of, parts
 from valveflow_ros.signals.units import Unit, unit_of
 
 Row = tuple[int, int, float, int]
@@ -32,30 +33,34 @@ _HEAD = 4  # bytes of encapsulation before the data, which give the encoding
 
 @dataclass(frozen=True, slots=True)
 class InputTopic:
-    """A topic of the contract to which the monitor subscribes."""
+    """A topic to which the monitor subscribes; ``topic`` is its name before remapping."""
 
     name: str
     message_type: type
     type_name: str
-    signals: tuple[Signal, ...]
+    topic: str
 
 
 # The optional signal comes first, so that it is known when the required ones are complete.
 _IN_ORDER = tuple(sorted(SIGNALS, key=lambda info: info.required))
 INPUTS: tuple[InputTopic, ...] = (
-    *(
-        InputTopic(info.topic, Float64, 'std_msgs/msg/Float64', (info.signal,))
-        for info in _IN_ORDER
-    ),
-    InputTopic(
-        PLANT_SAMPLE,
-        PlantSample,
-        'valveflow_msgs/msg/PlantSample',
-        tuple(info.signal for info in _IN_ORDER),
-    ),
+    *(InputTopic(info.topic, Float64, 'std_msgs/msg/Float64', info.topic) for info in _IN_ORDER),
+    InputTopic(PLANT_SAMPLE, PlantSample, 'valveflow_msgs/msg/PlantSample', PLANT_SAMPLE),
 )
 INPUT_BY_NAME = {topic.name: topic for topic in INPUTS}
 INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
+
+
+def inputs_of(settings: Settings) -> tuple[InputTopic, ...]:
+    """Return all topics to which the monitor subscribes: those of covariates come first."""
+    beside = map(parts, entries_of(settings))
+    return (
+        *(
+            InputTopic(f'covariate {name}', Float64, 'std_msgs/msg/Float64', topic)
+            for name, topic, _ in beside
+        ),
+        *INPUTS,
+    )
 
 
 def header_time_ns(data: bytes) -> int:
@@ -113,6 +118,9 @@ class Decoder:
         for info in SIGNALS:
             unit = unit_of(info.signal, settings.text(f'{info.topic}_unit'))
             self._read[info.topic] = _float_reader(info.signal, unit)
+        beside = (topic for topic in inputs_of(settings) if topic.name not in INPUT_BY_NAME)
+        for number, topic in enumerate(beside, start=N_SIGNALS):
+            self._read[topic.name] = _float_reader(number, Unit(1.0))
 
     def time_ns(self, name: str, data: bytes, otherwise_ns: int) -> int:
         """Return the stamp of a message with a header, otherwise ``otherwise_ns``."""
@@ -131,7 +139,8 @@ class Decoder:
     def recorded(self, name: str, data: bytes, publish_time_ns: int) -> list[Row]:
         """Return the readings in a recorded message as in the live run."""
         time_ns = self.time_ns(name, data, publish_time_ns)
-        if time_ns <= 0:
+        # A restart may have other covariates than the recording.
+        if time_ns <= 0 or name not in self._read:
             return []
         try:
             return self.rows(name, data, time_ns)
@@ -139,7 +148,7 @@ class Decoder:
             return []
 
 
-def _float_reader(signal: Signal, unit: Unit) -> Callable[[bytes, int], list[Row]]:
+def _float_reader(signal: int, unit: Unit) -> Callable[[bytes, int], list[Row]]:
     scale, offset = unit.scale, unit.offset
     number, good = int(signal), int(Quality.GOOD)
 

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64
 from valveflow_msgs.msg import Prediction
 
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
@@ -55,7 +56,7 @@ class Player:
     ----------
     node : Node
     names : iterable of str
-        The inputs that will be published.
+        The inputs that will be published; any other name is the topic of a covariate.
     rate : float
         Speed relative to the samples' own time; 0: as fast as the monitor can process them.
     use_clock : bool
@@ -77,7 +78,9 @@ class Player:
         self._stop = stop
         qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
         self.publishers: Mapping[str, Publisher] = {
-            name: node.create_publisher(INPUT_BY_NAME[name].message_type, name, qos)
+            name: node.create_publisher(
+                INPUT_BY_NAME[name].message_type if name in INPUT_BY_NAME else Float64, name, qos
+            )
             for name in names
         }
         self._clock = node.create_publisher(Clock, '/clock', qos) if use_clock else None
@@ -91,6 +94,8 @@ class Player:
 
     def wait_for_listeners(self, patience_s: float) -> list[str]:
         """Wait until every input has a subscriber; return the topics that have none.
+
+        Nobody needs to listen to a covariate.
 
         Parameters
         ----------
@@ -139,8 +144,8 @@ class Player:
     def _without_listener(self) -> list[str]:
         return [
             str(publisher.topic_name)
-            for publisher in self.publishers.values()
-            if publisher.get_subscription_count() == 0
+            for name, publisher in self.publishers.items()
+            if name in INPUT_BY_NAME and publisher.get_subscription_count() == 0
         ]
 
     def _sleep_until(self, until_s: float) -> None:

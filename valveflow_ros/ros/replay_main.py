@@ -24,6 +24,7 @@ from valveflow_ros.report.terminal.progress import Progress
 from valveflow_ros.report.terminal.text import number
 from valveflow_ros.ros.decoding import (
     INPUT_BY_NAME,
+    INPUTS,
     PLANT_SAMPLE,
     header_time_ns,
     with_todays_codes,
@@ -80,12 +81,12 @@ def parser() -> argparse.ArgumentParser:
 def input_topics(log: LogContents) -> dict[str, str]:
     """Return the topics of a recording to play, each with its input.
 
-    A recording of the monitor states which of its topics were inputs. In other
-    recordings inputs are recognised by topic name and type.
+    A recording of the monitor states which of its topics were inputs; a covariate keeps its
+    topic. In other recordings inputs are recognised by topic name and type.
     """
     try:
         told = json.loads(log.attachments[TOPICS])['inputs']
-        known = {str(topic): str(name) for name, topic in told.items() if name in INPUT_BY_NAME}
+        known = {str(t): str(name if name in INPUT_BY_NAME else t) for name, t in told.items()}
     except (KeyError, ValueError, TypeError, AttributeError):
         known = {topic: SIGNALS[signal].topic for signal, topic in log.signals.items()}
         for topic, info in log.topics.items():
@@ -96,7 +97,7 @@ def input_topics(log: LogContents) -> dict[str, str]:
         for topic, name in known.items()
         if topic in log.topics
         and log.topics[topic].count
-        and log.topics[topic].type == INPUT_BY_NAME[name].type_name
+        and log.topics[topic].type == INPUT_BY_NAME.get(name, INPUTS[0]).type_name
     }
 
 

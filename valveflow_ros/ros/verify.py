@@ -31,6 +31,7 @@ from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.node.recording import PARAMETERS, TOPICS
 from valveflow_ros.ros.node.worker import DiagnosisWorker, FitWorker, Task, Worker
 from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.covariates import entries_of
 
 # Small, so that outputs before a decision that cannot be repeated are still compared.
 _BLOCK = 500
@@ -196,9 +197,10 @@ class _Replay:
             settings.text('unit_tag'), settings.output_unit, settings.zone, self._begun_ns()
         )
         yield from outputs.latched()
-        monitor = Monitor(settings, corrector_of_run(self._log, settings))
+        covariates = entries_of(settings)
+        monitor = Monitor(settings, corrector_of_run(self._log, settings), covariates)
         replayer = JournalReplayer(monitor, journal, diagnose_in_process, compute=self._fit)
-        aligner, decoder = Aligner(settings), Decoder(settings)
+        aligner, decoder = Aligner(settings, covariates), Decoder(settings)
         inputs = self._messages(self._inputs)
         topics = self._log.topics
         total = sum(topics[topic].count for topic in self._inputs if topic in topics)

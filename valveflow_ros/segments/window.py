@@ -55,6 +55,8 @@ def found_of(values: list[Any]) -> FoundSegment:
 
 
 _FIRST_ROOM = 16384
+# Rows of data before those of the covariates: u, power, temperature, opening and command.
+_SIGNALS = 5
 # A step back of the clock is accepted after this much of the new time.
 _DOUBT_S = 3600.0
 
@@ -74,6 +76,8 @@ class WindowContents:
         The opening from which u was computed, NaN if it was not given; empty if unknown.
     command_percent : float64 (n,) or (0,)
         The commanded opening, NaN if there was none; empty if there never was one.
+    covariates : dict of str to float64 (n,)
+        Values of further columns by entry; see `signals.covariates`.
     """
 
     time_ns: IntArray
@@ -83,6 +87,7 @@ class WindowContents:
     spans: IntArray
     opening_percent: FloatArray = field(default_factory=lambda: np.empty(0))
     command_percent: FloatArray = field(default_factory=lambda: np.empty(0))
+    covariates: dict[str, FloatArray] = field(default_factory=dict)
 
     def special_rows(self) -> IntArray:
         """Return the rows in special segments, in chronological order."""
@@ -130,6 +135,8 @@ class RollingWindow:
         m of the u = V p^m of the rows.
     least_s : mapping of SegmentKind to float, optional
         Minimum length of a segment of a kind that is kept if a clock step cuts it.
+    covariates : tuple of str
+        Entries of further columns, in the order in which `append` receives them.
 
     Notes
     -----
@@ -147,8 +154,10 @@ class RollingWindow:
         period_s: float,
         exponent: float = PAPER_EXPONENT,
         least_s: Mapping[SegmentKind, float] | None = None,
+        covariates: tuple[str, ...] = (),
     ) -> None:
         self._exponent = exponent
+        self._covariates = covariates
         self._least = {
             kind: math.ceil(seconds / period_s) for kind, seconds in (least_s or {}).items()
         }
@@ -165,7 +174,7 @@ class RollingWindow:
         self._clear()
 
     @classmethod
-    def of(cls, settings: Settings) -> RollingWindow:
+    def of(cls, settings: Settings, covariates: tuple[str, ...] = ()) -> RollingWindow:
         """Return an empty window of the length in the settings."""
         return cls(
             86400.0 * settings.real('window_days'), settings.real('sample_period'),
@@ -174,6 +183,7 @@ class RollingWindow:
                 SegmentKind.STEADY: settings.real('steady_min'),
                 SegmentKind.SLOPE: settings.real('slope_min'),
             },
+            covariates,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -210,14 +220,17 @@ class RollingWindow:
         temperature_degc: FloatArray,
         opening_percent: FloatArray | None = None,
         command_percent: FloatArray | None = None,
+        covariates: FloatArray | None = None,
     ) -> None:
         """Append rows in chronological order; rows outside the window are dropped."""
-        data = np.full((5, len(time_ns)), np.nan)
+        data = np.full((len(self._data), len(time_ns)), np.nan)
         data[0], data[1], data[2] = u, power_mw, temperature_degc
         if opening_percent is not None:
             data[3] = opening_percent
         if command_percent is not None:
             data[4] = command_percent
+        if covariates is not None:
+            data[_SIGNALS:] = covariates.T
         number = np.arange(self._seen, self._seen + len(time_ns), dtype=np.int64)
         self._seen += len(time_ns)
         done = 0
@@ -321,7 +334,7 @@ class RollingWindow:
         u, power, opening = (self._data[k, part].copy() for k in (0, 1, 3))
         return self._time_ns[part].copy(), u, power, opening
 
-    def contents(self, since_ns: int = 0) -> WindowContents:
+    def contents(self, since_ns: int = 0, *, covariates: bool = False) -> WindowContents:
         """Return a copy of the rows inside the window since a time, and their segments."""
         since = int(np.searchsorted(self._time_ns[: self._end], since_ns))
         inside = slice(max(self._first(), since), self._end)
@@ -343,30 +356,35 @@ class RollingWindow:
             self._data[3, inside].copy(),
             # Most units do not log the command, and a snapshot is sent to another process.
             command.copy() if np.isfinite(command).any() else np.empty(0),
+            self._beside(self._data[:, inside]) if covariates else {},
         )
+
+    def _beside(self, data: FloatArray) -> dict[str, FloatArray]:
+        """Return copies of the covariates in some rows, by entry."""
+        return {e: data[k].copy() for k, e in enumerate(self._covariates, start=_SIGNALS)}
 
     def snapshot(self) -> State:
         """Return the state to be saved."""
         rows, aside = self._held(), self._aside
         return {
             'seen': self._seen,
-            **_plain(
+            **self._plain(
                 _Aside(
                     0, self._time_ns[rows], self._number[rows], self._data[:, rows],
                     list(self._segments),
                 )
             ),
-            'aside': aside and _plain(aside),
+            'aside': aside and self._plain(aside),
         }  # fmt: skip
 
     def restore(self, saved: State) -> None:
         """Continue from a saved state; raise `DataError` if it is invalid."""
-        rows, aside = _rows_of(saved), perhaps(saved, 'aside', dict)
+        rows, aside = self._rows_of(saved), perhaps(saved, 'aside', dict)
         self._clear()
         self._seen = perhaps(saved, 'seen', int) or 0
         self._add(rows.time_ns, rows.number, rows.data)
         self._segments = deque(rows.segments)
-        self._aside = None if aside is None else _rows_of(aside)
+        self._aside = None if aside is None else self._rows_of(aside)
 
     def find_segments_anew(
         self, settings: Settings, exponent: float, found_before: int
@@ -405,7 +423,7 @@ class RollingWindow:
         self._room = min(_FIRST_ROOM, self._most_room)
         self._time_ns = np.empty(self._room, dtype=np.int64)
         self._number = np.empty(self._room, dtype=np.int64)
-        self._data = np.empty((5, self._room))
+        self._data = np.empty((_SIGNALS + len(self._covariates), self._room))
         self._end = 0
 
     def _add(self, time_ns: IntArray, number: IntArray, data: FloatArray) -> None:
@@ -497,7 +515,7 @@ class RollingWindow:
         end, self._room = self._end, room
         time_ns, number, data = self._time_ns, self._number, self._data
         self._time_ns, self._number = np.empty(room, np.int64), np.empty(room, np.int64)
-        self._data = np.empty((5, room))
+        self._data = np.empty((len(data), room))
         self._time_ns[:end], self._number[:end] = time_ns[:end], number[:end]
         self._data[:, :end] = data[:, :end]
 
@@ -509,33 +527,40 @@ class RollingWindow:
         while self._segments and self._segments[0].first_row < first:
             self._segments.popleft()
 
+    def _plain(self, rows: _Aside) -> State:
+        """Return rows and segments as plain values; most units do not log the command."""
+        command = rows.data[4]
+        beside = {'covariates': self._beside(rows.data)} if self._covariates else {}
+        return {
+            'from_ns': rows.from_ns,
+            'time_ns': rows.time_ns.copy(),
+            'number': rows.number.copy(),
+            'rows': rows.data[:4].copy(),
+            'command': command.copy() if np.isfinite(command).any() else np.empty(0),
+            'segments': [found_values(found) for found in rows.segments],
+            **beside,
+        }
+
+    def _rows_of(self, saved: State) -> _Aside:
+        """Return rows and segments from plain values; raise `DataError` if they are invalid.
+
+        Covariates that were not saved are NaN.
+        """
+        time_ns, number, rows, command = (
+            saved[n] for n in ('time_ns', 'number', 'rows', 'command')
+        )
+        n, beside = len(time_ns), saved.get('covariates', {})
+        unknown = np.full(n, np.nan)
+        last = [command if len(command) else unknown]
+        last += [beside.get(entry, unknown) for entry in self._covariates]
+        if rows.shape != (4, n) or len(number) != n or any(x.shape != (n,) for x in last):
+            raise DataError('The saved state has rows of different lengths.')
+        segments = [found_of(values) for values in saved['segments']]
+        data = np.concatenate([rows, np.stack(last)])
+        return _Aside(perhaps(saved, 'from_ns', int) or 0, time_ns, number, data, segments)
+
 
 def _has(numbers: IntArray, number: int) -> bool:
     """Return True if a row number is among the given ones."""
     place = int(np.searchsorted(numbers, number))
     return place < len(numbers) and int(numbers[place]) == number
-
-
-def _plain(rows: _Aside) -> State:
-    """Return rows and segments as plain values; most units do not log the command."""
-    command = rows.data[4]
-    return {
-        'from_ns': rows.from_ns,
-        'time_ns': rows.time_ns.copy(),
-        'number': rows.number.copy(),
-        'rows': rows.data[:4].copy(),
-        'command': command.copy() if np.isfinite(command).any() else np.empty(0),
-        'segments': [found_values(found) for found in rows.segments],
-    }
-
-
-def _rows_of(saved: State) -> _Aside:
-    """Return rows and segments from plain values; raise `DataError` if they are invalid."""
-    time_ns, number, rows, command = (saved[n] for n in ('time_ns', 'number', 'rows', 'command'))
-    n = len(time_ns)
-    if rows.shape != (4, n) or len(number) != n or len(command) not in (0, n):
-        raise DataError('The saved state has rows of different lengths.')
-    last = command if len(command) else np.full(n, np.nan)
-    segments = [found_of(values) for values in saved['segments']]
-    data = np.concatenate([rows, last[None]])
-    return _Aside(perhaps(saved, 'from_ns', int) or 0, time_ns, number, data, segments)

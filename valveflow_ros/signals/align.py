@@ -14,9 +14,10 @@ All dropped readings are counted; see `REASONS`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,7 @@ from valveflow_ros.records import (
     SampleTable,
     Signal,
 )
+from valveflow_ros.signals.covariates import Arriving
 
 # The loop that converts readings into rows; the module docstring describes the rules.
 
@@ -371,11 +373,15 @@ class Aligner:
     ----------
     settings : Settings
         Sample period, hold limit, lateness, clock jump, plausible ranges.
+    covariates : tuple of str
+        Entries of covariates, whose readings have the numbers that follow those of the signals;
+        see `signals.covariates`. They have no influence on the rows of the signals.
     """
 
     _ROOM = 65536  # maximum number of rows of one call of the kernel
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, covariates: tuple[str, ...] = ()) -> None:
+        self._beside = Arriving(covariates) if covariates else None
         period = settings.real('sample_period')
         limits = np.empty((N_SIGNALS, 2))
         for info in SIGNALS:
@@ -410,7 +416,17 @@ class Aligner:
 
     def feed(self, readings: Readings) -> Aligned:
         """Process readings in their order of arrival and return the rows that they close."""
-        return self._run(readings, final=False)
+        if self._beside is None:
+            return self._run(readings, final=False)
+        blocks, done = [], 0
+        for k in np.flatnonzero(readings.signal >= N_SIGNALS).tolist():
+            if k > done:
+                blocks.append(self._run(readings.part(done, k), final=False))
+            number = int(readings.signal[k]) - N_SIGNALS
+            self._beside.take(number, int(readings.time_ns[k]), float(readings.value[k]))
+            done = k + 1
+        blocks.append(self._run(readings.part(done, len(readings)), final=False))
+        return gathered(blocks)
 
     def finish(self) -> Aligned:
         """Close the rows up to the newest stamp; for the end of a file."""
@@ -431,11 +447,14 @@ class Aligner:
 
     def snapshot(self) -> state.State:
         """Return the state to be saved."""
-        return state.copies(self._state._asdict())
+        saved = state.copies(self._state._asdict())
+        return saved if self._beside is None else {**saved, 'covariates': self._beside.snapshot()}
 
     def restore(self, saved: state.State) -> None:
         """Continue from a saved state; raise `DataError` if it is invalid."""
         state.put_back(self._state._asdict(), saved)
+        if self._beside is not None:
+            self._beside.restore(saved.get('covariates', {}))
 
     def _run(self, readings: Readings, final: bool) -> Aligned:
         tables: list[SampleTable] = []
@@ -463,6 +482,10 @@ class Aligner:
             if written < room - self._rules.spare and done >= len(readings):
                 break
         table = tables[0] if len(tables) == 1 else SampleTable.concatenate(tables)
+        if self._beside is not None:
+            edges = itertools.pairwise([0, *resets, len(table)])
+            beside = [self._beside.at(table.time_ns[start:end]) for start, end in edges]
+            table = replace(table, covariates=np.concatenate(beside))
         return Aligned(table, np.array(resets, dtype=np.int64))
 
 

@@ -73,12 +73,13 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 def _checked(file: Path) -> VerbResult:
     """Read a parameter file as the monitor would, and return its changes."""
-    from valveflow_ros.interface.settings import read_parameters
+    from valveflow_ros.interface.settings import check_names, read_parameters
     from valveflow_ros.parameters import PARAMETERS, Settings
 
     given = read_parameters(file, [], of_node=True)
     try:
         settings = Settings(given)
+        check_names(settings)
     except ParameterError as error:
         raise InputError(f'{file}: {error}') from None
     changed = {

@@ -13,14 +13,15 @@ from valveflow_ros.cli.command import (
     VerbResult,
     add_analysis,
     add_analysis_options,
+    add_covariate,
     checked_parameters,
     columns,
+    covariates_of,
     lines,
     log_of,
     mapping_of,
     write_results,
 )
-from valveflow_ros.errors import UsageError
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.diagnose import DiagnosisResult
@@ -51,18 +52,14 @@ def arguments(parser: ArgumentParser) -> None:
         help='characteristic.json or extended_model.json of an earlier log, to compare with '
         'this one; found anew without it',
     )  # fmt: skip
-    parser.add_argument(
-        '--covariate', action='append', default=[], metavar='NAME=COLUMN[:UNIT]',
-        help='a column beside the signals that the power may follow, such as '
-        'vacuum=condenser_pressure_kpa; may be given several times',
-    )  # fmt: skip
+    add_covariate(parser)
     add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
     """Open the log, diagnose, write."""
     mapping = mapping_of(options)
-    covariates = _covariates(options.covariate)
+    covariates = covariates_of(options)
     console(0.0, 'starting')
     from valveflow_ros.diagnosis.result import to_json
     from valveflow_ros.interface.diagnose import diagnose, load_diagnosable
@@ -77,19 +74,6 @@ def run(options: Namespace, console: Console) -> VerbResult:
     found = diagnose(log, parameters=given, model=model, covariates=covariates, progress=console)
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), to_json(found.diagnosis))
-
-
-def _covariates(said: list[str]) -> dict[str, str]:
-    """Return the columns by name; raises `UsageError`."""
-    found: dict[str, str] = {}
-    for text in said:
-        name, equals, theirs = (part.strip() for part in text.partition('='))
-        if not equals or not name or not theirs:
-            raise UsageError(f"--covariate '{text}' is not of the form NAME=COLUMN[:UNIT].")
-        if name in found:
-            raise UsageError(f'--covariate {name} is given twice.')
-        found[name] = theirs
-    return found
 
 
 def _text(found: DiagnosisResult) -> str:

@@ -13,8 +13,10 @@ from valveflow_ros.cli.command import (
     VerbResult,
     add_analysis,
     add_analysis_options,
+    add_covariate,
     checked_parameters,
     columns,
+    covariates_of,
     lines,
     log_of,
     mapping_of,
@@ -37,7 +39,10 @@ and quicker, without the diagnoses:
 
 and quickest, by a curve that is there already, without a fit:
   valveflow monitor plant.mcap -o result --reference health/characteristic.json \\
-      --no-diagnosis --set refit_period=0 --set refit_segments=0 --set alarm_on_delay=600"""
+      --no-diagnosis --set refit_period=0 --set refit_segments=0 --set alarm_on_delay=600
+
+with the condenser pressure, which the diagnoses try as a cause:
+  valveflow monitor plant.csv -o result --covariate vacuum=condenser_pressure_kpa"""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -57,12 +62,14 @@ def arguments(parser: ArgumentParser) -> None:
         '--no-diagnosis', action='store_true',
         help='leave out the diagnoses, each of which takes as long as `valveflow diagnose`',
     )  # fmt: skip
+    add_covariate(parser)
     add_analysis_options(parser)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
     """Open the log, run the monitor, write."""
     mapping = mapping_of(options)
+    covariates = covariates_of(options)
     console(0.0, 'starting')
     from valveflow_ros.interface.monitor import monitor
 
@@ -70,7 +77,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     log = log_of(options, mapping, console)
     found = monitor(
         log, parameters=given, model=options.model, reference=options.reference,
-        diagnose=not options.no_diagnosis, progress=console,
+        diagnose=not options.no_diagnosis, covariates=covariates or None, progress=console,
     )  # fmt: skip
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), found.to_json())

@@ -7,10 +7,13 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
+import re
+from collections.abc import Iterable
 
 from valveflow_ros.diagnosis.cause import Cause
 from valveflow_ros.diagnosis.causes.covariate import covariate_cause
 from valveflow_ros.diagnosis.grids import Grids
+from valveflow_ros.errors import InputError
 
 # The action an operator takes for each cause and each fault of a record, by name.
 TO_DO = {
@@ -167,6 +170,25 @@ def catalogue() -> dict[str, Cause]:
         made for module in modules for made in vars(module).values() if isinstance(made, Cause)
     ]
     return {cause.name: cause for cause in sorted(causes, key=lambda cause: cause.name)}
+
+
+_NAME = re.compile(r'[A-Za-z]\w{0,39}', re.ASCII)
+
+
+def check_covariates(names: Iterable[str], where: str = '--covariate') -> None:
+    """Raise `InputError` if the name of a covariate is invalid or already has another meaning.
+
+    ``where`` says in the message where the names were given.
+    """
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise InputError(
+                f"{where} '{name}': a name has letters, digits and underscores, at most 40."
+            )
+        if name in catalogue():
+            raise InputError(
+                f"{where} '{name}' is a cause of the catalogue already; choose another name."
+            )
 
 
 def causes_for(grids: Grids) -> dict[str, Cause]:

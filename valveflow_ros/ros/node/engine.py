@@ -45,6 +45,7 @@ from valveflow_ros.ros.decoding import Row
 from valveflow_ros.ros.node.worker import FitWorker, Worker
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.covariates import entries_of
 from valveflow_ros.state import State
 
 
@@ -75,8 +76,9 @@ class LiveEngine:
         diagnosis_worker: Worker | None = None,
         corrector: Corrector | None = None,
     ) -> None:
-        self.aligner = Aligner(settings)
-        self.monitor = Monitor(settings, corrector)
+        covariates = entries_of(settings)
+        self.aligner = Aligner(settings, covariates)
+        self.monitor = Monitor(settings, corrector, covariates)
         self.last_fit_s: float | None = None
         self.last_diagnosis_s: float | None = None
         self._fit_worker = fit_worker

@@ -22,7 +22,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, SignalInfo
 from valveflow_ros.report.words import duration
-from valveflow_ros.ros.decoding import PLANT_SAMPLE, Row, plausible_range
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, PLANT_SAMPLE, Row, plausible_range
 from valveflow_ros.ros.encoding import NOT_YET
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.intake import TopicStatistics
@@ -117,6 +117,8 @@ class InputHealth:
         """Store the stamps and the last impossible value of each signal, for the sentences."""
         host_ns = time.time_ns()
         for time_ns, number, value, _ in rows:
+            if number >= len(SIGNALS):
+                continue
             self._last_ns[number] = time_ns
             self._lead_ns[number] = max(self._lead_ns[number], time_ns - host_ns)
             low, high = self._ranges[number]
@@ -132,7 +134,7 @@ class InputHealth:
         listening_s: float,
         newest_ns: int = 0,
     ) -> list[Item]:
-        """Return an item for each signal.
+        """Return an item for each signal and each covariate.
 
         Parameters
         ----------
@@ -157,7 +159,7 @@ class InputHealth:
             if received.received:
                 level, sentence = self._judge(info, name, received, seen, reasons, now_s)
             else:
-                level, sentence = self._judge_silent(info, name, seen, listening_s)
+                level, sentence = self._judge_silent(info.required, name, seen, listening_s)
             both = (info.topic, PLANT_SAMPLE)
             twice = all(publishers.get(n, unknown).right and statistics[n].received for n in both)
             if level <= Level.WARN and info.required and twice:
@@ -166,6 +168,11 @@ class InputHealth:
                 sentence = f'{mixed} are both published; their values are mixed. Stop one of them.'
             values = self._values(name, received, seen, reasons, now_s)
             found.append(Item(f'input {info.topic}', level, sentence, values))
+        for name in (name for name in self._topics if name not in INPUT_BY_NAME):
+            received, seen = statistics[name], publishers.get(name, unknown)
+            level, sentence = self._judge_covariate(name, received, seen, now_s, listening_s)
+            values = self._values(name, received, seen, {}, now_s)
+            found.append(Item(f'input {name}', level, sentence, values))
         return found
 
     def _values(
@@ -191,7 +198,8 @@ class InputHealth:
             'Messages that wait for the first /clock': received.waiting,
         }
         # The engine goes on from a saved state and counts on; the intake begins anew.
-        return values | {f'Readings {r.replace("_", " ")} in all runs': counts[r] for r in REASONS}
+        told = {f'Readings {r.replace("_", " ")} in all runs': n for r, n in counts.items()}
+        return values | told
 
     def _judge(
         self,
@@ -234,15 +242,29 @@ class InputHealth:
             return Level.WARN, off
         if lost:
             return Level.WARN, f'{lost} messages of {topic} were lost on the way.'
-        hz = received.rate_hz()
-        if hz is None:
-            rate = 'The first message has come'
-        else:
-            rate = f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
+        rate = _rate(received)
         return Level.OK, f'{rate}; {behind}.' if behind else f'{rate}.'
 
+    def _judge_covariate(
+        self,
+        name: str,
+        received: TopicStatistics,
+        seen: Publishers,
+        now_s: float,
+        listening_s: float,
+    ) -> tuple[Level, str]:
+        topic = self._topics[name]
+        if not received.received:
+            return self._judge_silent(False, name, seen, listening_s)
+        if seen.wrong_types:
+            return _wrong_type(topic, seen)
+        if received.stale(now_s):
+            age_s = received.age_s(now_s)
+            return Level.OK, f'{topic} has been silent for {age_s:.1f} s; it is optional.'
+        return Level.OK, f'{_rate(received)}.'
+
     def _judge_silent(
-        self, info: SignalInfo, name: str, seen: Publishers, listening_s: float
+        self, required: bool, name: str, seen: Publishers, listening_s: float
     ) -> tuple[Level, str]:
         topic = self._topics[name]
         if seen.wrong_types:
@@ -252,7 +274,7 @@ class InputHealth:
                 f'{topic} is published as best effort and asked for as reliable, so nothing '
                 'comes: set input_reliability, and qos_overrides if given, to best_effort.'
             )
-        if not info.required:
+        if not required:
             return Level.OK, f'{topic} is not sent; it is optional.'
         if listening_s < _PATIENCE_S:
             return Level.OK, f'Waiting for {topic}.'
@@ -326,6 +348,13 @@ class InputHealth:
         last = self._counted.get((topic, what), 0)
         self._counted[topic, what] = count
         return max(0, count - last)
+
+
+def _rate(received: TopicStatistics) -> str:
+    hz = received.rate_hz()
+    if hz is None:
+        return 'The first message has come'
+    return f'{hz:.0f} Hz' if hz >= 100.0 else f'{hz:.3g} Hz'
 
 
 def _wrong_type(topic: str, seen: Publishers) -> tuple[Level, str]:

@@ -291,7 +291,7 @@ class Intake:
             for taken in found:
                 statistics.note_number(taken.sequence)
                 received_ns = taken.received_ns or now_ns
-                held = _Held(received_ns, INPUT_ORDER[name], now_s, name, taken)
+                held = _Held(received_ns, INPUT_ORDER.get(name, -1), now_s, name, taken)
                 self._hold(held)
             if len(found) >= DEPTH:
                 # The source has more messages, received after the last of these.

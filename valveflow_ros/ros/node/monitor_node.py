@@ -34,7 +34,6 @@ from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
-from valveflow_ros.ros.decoding import INPUTS
 from valveflow_ros.ros.domain import Presence
 from valveflow_ros.ros.encoding import encode
 from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
@@ -244,7 +243,7 @@ class MonitorNode(LifecycleNode):
         self.settings = Settings(declare.declare(self))
         self._ignored = declare.unknown_overrides(self) + declare.check_qos_overrides(self, {
             'publisher': [self.resolve_topic_name(f'~/{name}') for name in OUTPUTS],
-            'subscription': [self.resolve_topic_name(topic.name) for topic in INPUTS],
+            'subscription': declare.inputs(self, self.settings).values(),
         })  # fmt: skip
         self.add_pre_set_parameters_callback(declare.in_type)
         self.add_on_set_parameters_callback(self._check)
@@ -272,7 +271,8 @@ class MonitorNode(LifecycleNode):
 
     def _check(self, wanted: list[Parameter]) -> SetParametersResult:
         try:
-            declare.changed(self.settings, wanted, running=self.session is not None)
+            found = declare.changed(self.settings, wanted, running=self.session is not None)
+            declare.inputs(self, found)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -21,7 +21,8 @@ from valveflow_ros.logs import Qos, RecorderStatus
 from valveflow_ros.monitoring.events import CurveAdopted, Event
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.words import in_zone
-from valveflow_ros.ros.decoding import INPUTS, PLANT_SAMPLE, Decoder, sample_warnings
+from valveflow_ros.ros import declare
+from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, inputs_of, sample_warnings
 from valveflow_ros.ros.node import health, parameter_files
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, warm_up
@@ -75,7 +76,8 @@ class Session:
         self._settings = settings
         self._reference = parameter_files.given_reference(settings)
         self._model = parameter_files.given_model(settings)
-        self.inputs = {topic.name: node.resolve_topic_name(topic.name) for topic in INPUTS}
+        self._topics = inputs_of(settings)
+        self.inputs = declare.inputs(node, settings)
         self.outputs = {name: node.resolve_topic_name(f'~/{name}') for name in OUTPUTS}
         self._store = StateStore(settings)
         self._restart = Restart(settings, self._store, self.inputs, self.outputs, log)
@@ -147,7 +149,7 @@ class Session:
             self._subscriptions.append(made)
             return made
 
-        sources = {topic.name: subscription(topic.message_type, topic.name) for topic in INPUTS}
+        sources = {t.name: subscription(t.message_type, t.topic) for t in self._topics}
         clock = None
         if node.get_parameter('use_sim_time').value:
             clock = subscription(Clock, '/clock')
@@ -251,7 +253,7 @@ class Session:
             statistics = self._intake.statistics
             if now_s - self._looked_s >= _GRAPH_S:
                 self._looked_s = now_s
-                for topic in INPUTS:
+                for topic in self._topics:
                     full_name = self.inputs[topic.name]
                     seen = health.publishers(self._node, full_name, topic.type_name)
                     self._publishers_seen[topic.name] = seen
@@ -350,7 +352,7 @@ class Session:
         attachments = parameter_files.model_attachment(self._model)
         folder, began = self._restart.folder, self._restart.began
         recording = Recording(self._settings, topics, time.time(), attachments, folder, began)
-        for topic in INPUTS:
+        for topic in self._topics:
             full_name, kind = self.inputs[topic.name], topic.type_name
             recording.offer(
                 full_name, kind, functools.partial(health.offered, self._node, full_name, kind)

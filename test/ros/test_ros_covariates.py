@@ -1,0 +1,141 @@
+# Copyright 2026 valveflow maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""A covariate in the running node: from its topic into diagnosis, recording, state and health."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from listener import LATCHED, MONITOR, Listener, start_monitor
+from rclpy.parameter import Parameter
+from ros_helpers import Processes
+from valveflow_msgs.msg import Diagnosis
+
+import valveflow_ros as vf
+from valveflow_ros.cli.main import main
+from valveflow_ros.errors import ParameterError
+from valveflow_ros.interface.logs import read_covariate
+from valveflow_ros.logs import open_log
+from valveflow_ros.records import SIGNALS
+from valveflow_ros.ros.encoding import float64_bytes
+from valveflow_ros.ros.node.monitor_node import MonitorNode
+from valveflow_ros.ros.player import Player, Step
+from valveflow_ros.ros.replay_main import steps_of
+from valveflow_ros.ros.verify import verify
+
+TOPIC, COLUMN = '/condenser/pressure', 'condenser_pressure_kpa'
+REQUIRED = [info for info in SIGNALS if info.required]
+ROWS = 3600
+MINUTES = {
+    'covariates': f'vacuum={TOPIC}:kPa ambient=/weather/temperature', 'sample_period': 60.0,
+    'hold_limit': 150.0, 'lateness': 60.0, 'block': 60.0, 'alarm_block': 120.0,
+    'refit_period': 86400.0, 'diagnosis_hour': -1, 'diagnosis_on_mismatch': False,
+    'reference_after': 0.0, 'use_sim_time': True, 'state_period': 1.0,
+}  # fmt: skip
+
+
+def steps(frame: Any) -> Iterator[Step]:
+    """Yield the rows of a plant; every tenth value of the covariate is NaN."""
+    times = frame['time'].dt.tz_convert(None).to_numpy('datetime64[ns]').astype(np.int64)
+    for k, time_ns in enumerate(times.tolist()):
+        value = np.nan if k % 10 == 0 else frame[COLUMN].iloc[k]
+        row = [(info.topic, float64_bytes(frame[info.column].iloc[k])) for info in REQUIRED]
+        yield Step(time_ns, [(TOPIC, float64_bytes(value)), *row])
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
+    processes: Processes, context: Any, tmp_path: Path
+) -> None:
+    plant = vf.simulate(days=2.5, seed=3, unit='choked:number=3', recording='minute')
+    frame = plant.to_dataframe()
+    monitor = start_monitor(processes, tmp_path / 'recordings', **MINUTES)
+    listener = Listener(context)
+    names = [TOPIC, *(info.topic for info in REQUIRED)]
+    player = Player(listener.node, names, 0.0, True, lambda: False)
+    played = steps(frame)
+    assert player.wait_for_listeners(240.0) == []
+    player.play(itertools.islice(played, ROWS // 2))
+    taken = 'Samples taken in all runs'
+    listener.until(lambda: int(listener.value('fit', taken) or 0) > ROWS // 2 - 5, 'half of it')
+    listener.until(lambda: float(listener.value('state', 'Seconds since it was saved') or 9) < 0.5,
+                   'a saved state')  # fmt: skip
+    monitor.kill()
+    monitor.wait()
+    monitor = start_monitor(processes, tmp_path / 'recordings', **MINUTES)
+    listener.until(lambda: 'Going on after' in processes.output(monitor), 'the restart')
+    listener.health.clear()
+    assert player.wait_for_listeners(240.0) == []
+    player.play(played)
+    listener.until(lambda: int(listener.value('fit', taken) or 0) > ROWS - 50, 'all of it')
+    found: list[Diagnosis] = []
+    listener.node.create_subscription(Diagnosis, f'{MONITOR}/diagnosis', found.append, LATCHED)
+    assert listener.trigger('diagnose').success
+    listener.until(lambda: found and found[-1].causes, 'the diagnosis')
+    (cause,) = found[-1].causes
+    assert cause.name == 'vacuum'
+    truth = plant.data.unit.vacuum_per_kpa * frame['generated_power_mw'].mean()
+    b = cause.parameter_values[list(cause.parameter_names).index('b')]
+    assert b == pytest.approx(truth, rel=0.1)
+    assert f'for every kPa that {TOPIC} (vacuum) is higher' in cause.sentence
+
+    def told(name: str) -> tuple[bytes, str]:
+        items = {s.name.partition(': ')[2]: s for s in listener.health[-1].status}
+        return items[f'input covariate {name}'].level, items[f'input covariate {name}'].message
+
+    assert told('ambient') == (b'\x00', '/weather/temperature is not sent; it is optional.')
+    listener.until(lambda: 'has been silent for' in told('vacuum')[1], 'the silence')
+    level, sentence = told('vacuum')
+    assert level == b'\x00'
+    assert sentence.endswith(' s; it is optional.')
+    monitor.send_signal(signal.SIGTERM)
+    assert monitor.wait(20.0) == 0, processes.output(monitor)
+    listener.close()
+
+    (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
+    result = verify(folder)
+    assert result.difference == ''
+    assert result.compared['diagnosis'] >= 2
+    assert result.rows == result.compared['prediction'] > ROWS - 50
+    series = read_covariate(vf.open_log(folder), 'vacuum', TOPIC)
+    sent = frame[COLUMN].to_numpy()
+    np.testing.assert_array_equal(series.values, sent[np.arange(len(sent)) % 10 > 0])
+    inputs, again = steps_of(open_log(folder))
+    assert inputs[0] == TOPIC
+    assert [name for name, _ in next(again).messages] == names
+    out = str(tmp_path / 'why')
+    words = ['diagnose', str(folder), '-o', out, '--quiet', '--covariate', f'vacuum={TOPIC}']
+    assert main(words) == 0
+    assert '"vacuum"' in (tmp_path / 'why' / 'diagnosis.json').read_text()
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ('text', 'sentence'),
+    [
+        ('a-b=/x', "entry 'a-b': a name has letters, digits and underscores, at most 40."),
+        ('backlash=/x', "entry 'backlash' is a cause of the catalogue already; choose another"),
+        ('vacuum', "entry 'vacuum' is not of the form NAME=COLUMN[:UNIT]."),
+        ('a=/x//y', "entry '/x//y' is no name of a topic."),
+        ('a=/x b=/x', "entry '/x' is the topic of another input."),
+        ('a=/u2/generated_power', "entry '/u2/generated_power' is the topic of another input."),
+    ],
+)
+def test_a_bad_entry_is_refused_in_the_words_of_the_option(
+    context: Any, text: str, sentence: str
+) -> None:
+    wanted = Parameter('covariates', value=text)
+    with pytest.raises(ParameterError) as refused:
+        MonitorNode(context=context, parameter_overrides=[wanted])
+    assert f"Parameter 'covariates' cannot be used: {sentence}" in str(refused.value)
+    node = MonitorNode(context=context)
+    (answer,) = node.set_parameters([wanted])
+    assert (answer.successful, answer.reason) == (False, str(refused.value))
+    node.destroy_node()
