@@ -51,7 +51,7 @@ def test_the_file_keeps_its_contract(run, tmp_path, table):
 
 def test_it_is_told_in_words(run, tmp_path, table):
     ran = run('loop', table, '-o', tmp_path / 'out')
-    assert ran.out.startswith('FIC101.csv: stiction.\nThe valve sticks or has slack')
+    assert ran.out.startswith('FIC101.csv: stiction or slack.\nThe valve sticks or has slack')
     assert 'loop.json' in ran.out
 
 

@@ -72,7 +72,8 @@ TO_DO = {
         'give that one.'
     ),
     'gain_change': (
-        'First ask whether the cooling water was as warm then. If it was, and the power fell: '
+        'First ask whether the cooling water was as warm then, if its column was not given. If '
+        'it was, and the power fell: '
         'blading, heaters, an open bypass, or the scale of the power meter. If the change was '
         'meant, find a new curve and go on with it.'
     ),
@@ -84,9 +85,10 @@ TO_DO = {
     ),
     'gain_step': (
         'Ask what happened at the time named: a feed water heater or an extraction in or out '
-        'for good, work on the power meter, its current transformers or its scale. If it was '
-        'meant, find a new curve (in the node: `~/refit`) and set a new reference; if not, look '
-        'for a bypass that is open.'
+        'for good, work on the power meter, its current transformers or its scale. If nothing '
+        'did, look for a bypass that is open and for a valve that opens less than its sensor '
+        'says. If it was meant, find a new curve (`valveflow identify --from TIME`, in the node '
+        '`~/refit`) and set a new reference.'
     ),
     'input_change': (
         'Look into the calibration logs of pressure and position since the model was found, and '

@@ -144,7 +144,7 @@ GAIN_STEP = Cause(
     apply_gain_step, gain_step_starts, gain_step_sentence,
     ('input_step', 'curve_step', 'intervals', 'gain_drift'),
     'An hour on the flat end of the curve and an hour at low load: a step of the input '
-    'vanishes on the flat end.',
+    'vanishes on the flat end. Intervals end by themselves: wait some days.',
     a_day, slow=True,
 )  # fmt: skip
 
