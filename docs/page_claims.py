@@ -120,7 +120,8 @@ def _alarm() -> list[tuple[str, str, str]]:
     for study, question in _MONITOR.items():
         told = ', '.join(
             f'{_KIND_WORDS.get(kind, "the unit of the paper")} {s["alarms"]} alarms on '
-            f'{s["with_alarm"]} of {s["units"]}, {s["standing_at_the_end"]} with one at the end'
+            f'{s["with_alarm"]} of {s["units"]}, {s["standing_at_the_end"]} with one at the end, '
+            f'the same one at most {s["most_occurrences"]} times'
             for kind, s in result(study)['summary'].items()
         )
         rows.append(_row(question, told, study))
@@ -136,8 +137,8 @@ def _alarm() -> list[tuple[str, str, str]]:
 
 _MONITOR = {
     'monitor_healthy_441_448': 'the monitor on healthy units, 20 days each, means over a minute',
-    'monitor_all_times_3_441_441': 'the same with an effect of three times its default from day '
-    '10 on, one unit an effect; alarms since then',
+    'monitor_all_times_3_451_453': 'the same with an effect of three times its default from day '
+    '10 on, three units an effect; alarms since then',
 }
 
 

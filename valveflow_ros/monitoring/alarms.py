@@ -332,8 +332,9 @@ class ResidualAlarm(Alarm):
             return Content(value, _LIMIT, '', _sentence(state, shift_mw, self.onset_ns))
         side = 'more' if self._left_mw > 0.0 else 'less'
         sentence = (
-            f'The unit gave {abs(self._left_mw):.1f} MW {side} than its valve curve. The '
-            'openings since then do not show whether the difference is still there.'
+            f'The unit gave {abs(self._left_mw):.1f} MW {side} than its valve curve. Since then '
+            'the difference has been within the limit, but not for long enough at the openings of '
+            'the alarm.'
         )
         return Content(value, _LIMIT, '', sentence)
 
