@@ -49,7 +49,9 @@ class Screening:
 
     def __init__(self, **values):
         self.alarm = SimpleNamespace(active=False, raised_ns=MIDNIGHT_NS)
-        self.window = SimpleNamespace(span_s=5 * 86400.0, contents=lambda since_ns: EMPTY)
+        self.window = SimpleNamespace(
+            span_s=5 * 86400.0, contents=lambda since_ns, covariates: EMPTY
+        )
         self.score, self.time_ns, self.curve = 0.0, MIDNIGHT_NS, CURVE
         settings = Settings({'mismatch_limit': 5.0, 'diagnosis_hour': 2, **values})
         self.made = DiagnosisRequests(settings, self.alarm, self.journal)
