@@ -112,7 +112,7 @@ def test_a_name_whose_values_speak_against_it_is_refused_with_the_option(run, ge
 def test_a_gauge_pressure_is_made_absolute_and_said(run, german, tmp_path):
     german.write_bytes(german.read_bytes().replace(b';bar;', b';barg;'))
     ran = run('import', german, '-o', tmp_path / 'x.mcap')
-    assert 'gauge pressure (barg); 1.01325 bar of air' in ran.err
+    assert 'gauge pressure (barg); 1.01325 bar of air' in ran.out
     assert values(tmp_path / 'x.mcap', Signal.MAIN_STEAM_PRESSURE)[0] == pytest.approx(13.101325)
 
 
