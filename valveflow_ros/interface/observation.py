@@ -219,8 +219,10 @@ def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None
                 f'The log has no {info.topic}; name yours with --column {info.topic}=THEIRS, '
                 f'or give --constant {info.topic}=VALUE if it hardly changes.'
             )
-        told = ', '.join(f'{n} {REASON_WORDS.get(r, r)}' for r, n in refused.items())
-        raise DataError(f'{info.topic} has no usable value: {told}.')
+        told = ', '.join(f'{REASON_WORDS.get(r, r)} ({n} times)' for r, n in refused.items())
+        raise DataError(
+            f'{info.topic} has no usable value: {told}. Is it the right column, in its unit?'
+        )
 
 
 def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:

@@ -129,7 +129,7 @@ def doubt(
 
 
 def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:
-    """Refuse a table if all its main steam pressures are impossible, or a unit is surely wrong.
+    """Refuse a table if all values of a signal are impossible, or a unit is surely wrong.
 
     A unit is surely wrong if most values are impossible in it and usual in another unit.
 
@@ -139,7 +139,7 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
         Contains the options that would help.
     """
     for found in doubts:
-        lost = found.signal == Signal.MAIN_STEAM_PRESSURE and found.impossible >= 1.0
+        lost = SIGNALS[found.signal].required and found.impossible >= 1.0
         if not lost and not (found.looks_like and found.impossible > _MOST):
             continue
         topic, theirs = SIGNALS[found.signal].topic, names[found.signal]

@@ -82,7 +82,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 
 def _pieces(data: Validated) -> str:
-    from valveflow_ros.report.words import decimals, input_unit_plain, interval
+    from valveflow_ros.report.words import decimals, input_name, input_unit_plain, interval
 
     v = data.result
     rows = [
@@ -95,8 +95,8 @@ def _pieces(data: Validated) -> str:
         ]
         for k, c in enumerate((v.overall, *v.pieces))
     ]
-    unit = input_unit_plain(v.characteristic.pressure_exponent)
-    head = ['piece', f'u ({unit})', 'segments', 'measured - predicted (MW)', '95 % (MW)']
+    m = v.characteristic.pressure_exponent
+    head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})', 'segments', 'measured - predicted (MW)', '95 % (MW)']
     return columns(rows, head)
 
 
