@@ -318,10 +318,11 @@ class MonitorResult(Result):
 
     @property
     def advice(self) -> list[str]:
-        """Return effect in MW and advice of the causes that were named last."""
-        named = [d['causes'] for _, d in self.diagnoses if d['causes']]
-        told = [advice(c['name'], c['meaning'], c['to_do']) for c in (named or [[]])[-1]]
-        return [words for words in told if words]
+        """Return effect in MW and advice of the faults that were named last."""
+        # A covariate is no fault: there is nothing to do.
+        faults = [[c for c in d['causes'] if c['to_do']] for _, d in self.diagnoses]
+        last: list[dict[str, Any]] = next((causes for causes in reversed(faults) if causes), [])
+        return [advice(c['name'], c['meaning'], c['to_do']) for c in last]
 
     def texts(self) -> dict[str, str]:
         """Return ``monitor.json``; times are ns since 1970.

@@ -96,7 +96,13 @@ def _pieces(data: Validated) -> str:
         for k, c in enumerate((v.overall, *v.pieces))
     ]
     m = v.characteristic.pressure_exponent
-    head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})', 'segments', 'measured - predicted (MW)', '95 % (MW)']
+    head = [
+        'piece',
+        f'{input_name(m)} ({input_unit_plain(m)})',
+        'segments',
+        'measured - predicted (MW)',
+        '95 % (MW)',
+    ]
     return columns(rows, head)
 
 
