@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from streams import needs_jit
 import valveflow_ros as vf
 from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
+from valveflow_ros.interface.monitor import MonitorResult
 from valveflow_ros.logs import write_samples, write_table
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.report.words import moment, percent
@@ -308,6 +310,19 @@ class TestMonitor:
         settings = vf.monitor(frame, parameters=asked, diagnose=False).settings
         assert settings.whole('diagnosis_hour') == -1
         assert not settings.flag('diagnosis_on_mismatch')
+
+    def test_the_advice_is_that_of_the_faults_named_last(self):
+        def named(*causes):
+            keys = ('name', 'meaning', 'to_do')
+            return 0, {'causes': [dict(zip(keys, cause, strict=True)) for cause in causes]}
+
+        vacuum = ('vacuum', 'At full load it falls.', '')
+        step = ('input_step', 'This makes 4 MW less.', 'Look into the log.')
+        other = ('choked', 'This makes 2 MW less.', 'Open the turbine.')
+        told = [named(other), named(step, vacuum), named(vacuum), named()]
+        (said,) = MonitorResult.advice.fget(SimpleNamespace(diagnoses=told))
+        assert 'Look into the log.' in said
+        assert 'turbine' not in said
 
     def test_progress_follows_the_rows_and_names_each_fit_and_diagnosis(self, told, heard):
         shares = [share for share, _ in heard.told]

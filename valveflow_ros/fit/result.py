@@ -103,6 +103,7 @@ def from_refined(
         (float(b - _Z95 * s), float(b + _Z95 * s))
         for b, s in zip(knots[1:-1], knot_se, strict=True)
     )
+    # The curve at the usual pressure may reach loads that the unit never had.
     measured = samples.power_mw[samples.usable > 0]
     flow = np.clip(_flow_at_ends(m, samples), measured.min(), measured.max())
     ends = np.concatenate([flow, m.levels])

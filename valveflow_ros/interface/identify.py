@@ -97,7 +97,7 @@ class Identification(Result):
     @property
     def output_unit(self) -> str:
         """Return the unit of the curve's output."""
-        return self.characteristic.output_unit
+        return self.data.characteristic.output_unit
 
     def page(self) -> Page:
         """Return the report."""

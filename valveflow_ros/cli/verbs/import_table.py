@@ -262,7 +262,7 @@ def _refusal(refused: RefusedError, options: Namespace) -> str:
     if any(r.value.endswith(f'={THEIRS}') for r in refused.remedies):
         checks.append(f'with your names in place of {THEIRS}')
     if any(r.option == 'constant' for r in refused.remedies):
-        checks.append('with your usual temperature')
+        checks.append('with an assumed temperature: check it')
     if any(r.option in _CHOICES for r in refused.remedies) or ' or --' in refused.listing:
         checks.append('with the first of each choice: check it')
     head = ', '.join(['Then this reads it', *checks])
