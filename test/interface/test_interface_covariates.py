@@ -4,16 +4,21 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 from streams import needs_jit
 
 import valveflow_ros as vf
-from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.corrector import corrector_of, covariates_of
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json, to_json
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface.logs import Series, open_log, read_covariate
+from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.signals.covariates import entry
 
 COLUMN = 'condenser_pressure_kpa'
 
@@ -80,10 +85,64 @@ def test_a_damaged_covariate_is_refused_by_its_place(diagnosed, key, value):
         model_from_json(raw)
 
 
+def entry_of(model):
+    about = covariates_of(model)['vacuum']
+    return entry('vacuum', about.column, about.unit)
+
+
+def rows_of(plant):
+    """Return the rows of the plant, with its column beside them."""
+    frame = plant.to_dataframe()
+    time_ns = frame['time'].to_numpy('datetime64[ns]').astype(np.int64)
+    columns = frame.columns[1 : 1 + len(SIGNALS)]  # in the order of the signals
+    signals = dict(zip(Signal, (frame[c].to_numpy() for c in columns), strict=True))
+    table = SampleTable.from_columns(time_ns, signals)
+    return replace(table, covariates=frame[[COLUMN]].to_numpy().copy())
+
+
 @needs_jit
-def test_it_cannot_be_taken_out_of_rows_and_says_so(diagnosed):
-    with pytest.raises(DataError, match=f"'vacuum' follows the column '{COLUMN}'.*out of rows"):
-        corrector_of(diagnosed.extended_model, 60.0)
+def test_rows_without_the_column_cannot_be_freed_of_it(diagnosed):
+    model = diagnosed.extended_model
+    with pytest.raises(DataError, match=f"'vacuum', which follows the column '{COLUMN}'. Name"):
+        corrector_of(model, 60.0)
+    with pytest.raises(DataError, match="'vacuum' is in mbar, but the model has it in kPa"):
+        corrector_of(model, 60.0, (entry('vacuum', COLUMN, 'mbar'),))
+
+
+@needs_jit
+def test_freed_rows_do_not_depend_on_the_blocks(plant, diagnosed):
+    model = diagnosed.extended_model
+    rows = rows_of(plant).part(0, 3000)
+    rows.covariates[500:700] = np.nan  # less than six hours
+    rows.covariates[1000:1500] = np.nan  # more
+    whole = corrector_of(model, 60.0, (entry_of(model),)).correct(rows)
+    power = whole.column(Signal.GENERATED_POWER)
+    missing = np.flatnonzero(~np.isfinite(power))
+    assert missing[0] == 1000 + 6 * 60
+    assert missing[-1] == 1499
+    cut, parts = corrector_of(model, 60.0, (entry_of(model),)), []
+    for start, end in itertools.pairwise([0, 1, 17, 600, 1200, 1420, 1421, 3000]):
+        again = corrector_of(model, 60.0, (entry_of(model),))
+        again.restore(cut.snapshot())
+        parts.append(again.correct(rows.part(start, end)))
+        cut = again
+    assert SampleTable.concatenate(parts).values.tobytes() == whole.values.tobytes()
+
+
+@needs_jit
+def test_a_curve_and_a_monitor_without_the_weather(plant, diagnosed, tmp_path):
+    """The residual shrinks as the diagnosis found; the column is found by the model's own name."""
+    model, path = diagnosed.extended_model, tmp_path / 'plant.parquet'
+    plant.write(path)
+    plain, freed = vf.identify(path), vf.identify(path, model=model)
+    rmse = [r.characteristic.residuals.rmse_mw for r in (plain, freed)]
+    assert rmse[1] < 0.75 * rmse[0]
+    assert [h.name for h in freed.characteristic.held] == list(model.model.names)
+    told = vf.monitor(path, model=model, diagnose=False)
+    assert told.curves[-1][1].residuals.rmse_mw < 0.75 * rmse[0]
+    without = plant.to_dataframe().drop(columns=COLUMN)
+    with pytest.raises(InputError, match=f"has no column or topic '{COLUMN}"):
+        vf.identify(without, model=model)
 
 
 @needs_jit

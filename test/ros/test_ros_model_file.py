@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from extended_file import extended_json, write_extended
 from listener import start_monitor, start_plant
@@ -17,10 +19,15 @@ from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import open_log
 from valveflow_ros.parameters import Settings
+from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 from valveflow_ros.ros import verify as verifying
 from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.session import Session
 
+AT_200_MW = {
+    Signal.VALVE_OPENING: 1250.0 / 16.0**1.125, Signal.MAIN_STEAM_PRESSURE: 16.0,
+    Signal.MAIN_STEAM_TEMPERATURE: 539.0, Signal.GENERATED_POWER: 200.0,
+}  # fmt: skip
 HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_s': 3.0}}
 
 
@@ -38,6 +45,34 @@ def test_a_model_is_read_from_its_file(tmp_path: Path) -> None:
     assert [h.name for h in corrector.held] == list(HELD)
     kept = parameter_files.model_attachment(given)[parameter_files.ATTACHMENT]
     assert json.loads(kept) == extended_json(**HELD)
+
+
+def test_a_model_that_follows_a_covariate_needs_its_topic(tmp_path: Path) -> None:
+    vacuum = {
+        'name': 'vacuum', 'values': {'b': -1.2, 'a1': 0.0, 'a2': 0.0}, 'switches_s': [],
+        'covariate': {
+            'column': 'condenser_pressure', 'unit': 'kPa', 'spread': 1.0, 'power_mw': 200.0,
+            'centre': [500.0, 100.0, 16.0, 1.0], 'surface': [1.0, *[0.0] * 9],
+            'course': [5.0, 0.0, 0.0],
+        },
+    }  # fmt: skip
+    content = {**extended_json(), 'causes': [vacuum]}
+    path = tmp_path / 'extended_model.json'
+    path.write_text(json.dumps(content), encoding='utf-8')
+    without = Settings({'model_file': str(path)})
+    with pytest.raises(ParameterError, match="cause 'vacuum', which follows the column"):
+        parameter_files.given_model(without)
+    told = Settings({'model_file': str(path), 'covariates': 'ambient=/a vacuum=/condenser:kPa'})
+    corrector = parameter_files.corrector_for(parameter_files.given_model(told), told)
+    assert corrector is not None
+    rows = SampleTable.from_columns(
+        NS_PER_S * np.arange(40, dtype=np.int64),
+        {signal: np.full(40, value) for signal, value in AT_200_MW.items()},
+    )
+    rows = replace(rows, covariates=np.column_stack([np.full(40, np.nan), np.full(40, 7.0)]))
+    power = corrector.correct(rows).column(Signal.GENERATED_POWER)
+    # Two kPa above the usual 5 take 1.2 MW each.
+    assert power[-1] == pytest.approx(200.0 + 2.4, abs=1e-6)
 
 
 @pytest.mark.parametrize(

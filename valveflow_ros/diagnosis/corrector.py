@@ -29,7 +29,7 @@ from valveflow_ros.curve.regional_model import RegionalModel, make_taps
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import FittedCause, Stage
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, acts_on_scale
-from valveflow_ros.diagnosis.grids import Grids, Reference
+from valveflow_ros.diagnosis.grids import Covariate, Grids, Reference
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.records import (
@@ -41,6 +41,7 @@ from valveflow_ros.records import (
     SampleTable,
     Signal,
 )
+from valveflow_ros.signals.covariates import parts
 from valveflow_ros.state import Memory, State, put_back
 
 # Streaming versions of the causes with memory.
@@ -51,6 +52,9 @@ from valveflow_ros.state import Memory, State, put_back
 _DRAWS = 10  # the same number of noise realisations as in the catalogue
 _SEED = 20_240
 _LONGEST_DELAY_S = 660.0
+# What covariates do to the power changes over hours, so a missing value may be replaced by the
+# last one for this long.
+_KEEPS_NS = 6 * 3600 * NS_PER_S
 
 
 class Valve(Protocol):
@@ -229,11 +233,6 @@ def check_streams(active: tuple[FittedCause, ...]) -> None:
     DataError
     """
     for a in active:
-        if about := a.cause.covariate:
-            raise DataError(
-                f"The cause '{a.name}' follows the column '{about.column}', which is no signal of "
-                'the monitor: it cannot be taken out of rows yet. Hold only a model without it.'
-            )
         known = {Stage.OPENING: set(_VALVES), Stage.OUTPUT: _SHOWN}.get(a.cause.stage)
         if known is not None and a.name not in known:
             raise DataError(f"The cause '{a.name}' cannot be taken out of rows as they come yet.")
@@ -243,18 +242,84 @@ def check_streams(active: tuple[FittedCause, ...]) -> None:
 _HANDFUL = 16
 
 
-def corrector_of(given: ExtendedModel, step_s: float) -> Corrector:
+def covariates_of(given: ExtendedModel | None) -> dict[str, Covariate]:
+    """Return the covariates that the causes of a model follow, by name."""
+    if given is None:
+        return {}
+    own = (a.cause.covariate for a in given.model.active)
+    return {**covariates_of(given.on_top_of), **{about.name: about for about in own if about}}
+
+
+def corrector_of(
+    given: ExtendedModel, step_s: float, covariates: tuple[str, ...] = ()
+) -> Corrector:
     """Return the object that removes all causes of a model from rows ``step_s`` apart.
+
+    Parameters
+    ----------
+    given : ExtendedModel
+    step_s : float
+    covariates : tuple of str
+        Entries of the columns in `SampleTable.covariates`; see `signals.covariates`.
 
     Raises
     ------
     DataError
-        A cause has no streaming version.
+        A cause has no streaming version, or follows a covariate that the rows do not have.
     """
-    own = ModelCorrector(given, step_s)
+    own = ModelCorrector(given, step_s, covariates)
     if given.on_top_of is None:
         return own
-    return ChainCorrector(corrector_of(given.on_top_of, step_s), own)
+    return ChainCorrector(corrector_of(given.on_top_of, step_s, covariates), own)
+
+
+class Beside(Memory):
+    """The values of the covariates that causes follow, without gaps of a few hours.
+
+    Parameters
+    ----------
+    about : tuple of Covariate
+    entries : tuple of str
+        Entries of the columns in `SampleTable.covariates`.
+
+    Raises
+    ------
+    DataError
+        One has no column, or a column in another unit.
+    """
+
+    REMEMBERED = ('_last', '_last_ns')
+
+    def __init__(self, about: tuple[Covariate, ...], entries: tuple[str, ...]) -> None:
+        columns = {name: (k, unit) for k, (name, _, unit) in enumerate(map(parts, entries))}
+        self._about, self._places = about, []
+        for a in about:
+            if a.name not in columns:
+                raise DataError(
+                    f"The model has the cause '{a.name}', which follows the column '{a.column}'. "
+                    f"Name that column as covariate '{a.name}', or use a model without this cause."
+                )
+            place, unit = columns[a.name]
+            if unit and a.unit and unit != a.unit:
+                raise DataError(
+                    f"The covariate '{a.name}' is in {unit}, but the model has it in {a.unit}."
+                )
+            self._places.append(place)
+        self._last = np.full(len(about), np.nan)
+        self._last_ns = np.zeros(len(about), dtype=np.int64)
+
+    def feed(self, table: SampleTable) -> dict[str, tuple[Covariate, FloatArray]]:
+        """Return each covariate with its values, (n,); the last one holds for up to six hours."""
+        found = {}
+        for k, (about, place) in enumerate(zip(self._about, self._places, strict=True)):
+            assert table.covariates is not None
+            times = np.concatenate([self._last_ns[k : k + 1], table.time_ns])
+            values = np.concatenate([self._last[k : k + 1], table.covariates[:, place]])
+            last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+            self._last[k], self._last_ns[k] = values[last[-1]], times[last[-1]]
+            old = times - times[last] > _KEEPS_NS
+            found[about.name] = about, np.where(old, np.nan, values[last])[1:]
+        return found
 
 
 class ChainCorrector:
@@ -295,6 +360,8 @@ class ModelCorrector(Memory):
     given : ExtendedModel
     step_s : float
         Step of the rows.
+    covariates : tuple of str
+        Entries of the columns in `SampleTable.covariates`.
 
     Notes
     -----
@@ -303,19 +370,24 @@ class ModelCorrector(Memory):
     unknown. Before the record a drift is extrapolated backwards.
 
     After a gap the responses begin in equilibrium, as in the simulation; the plug keeps its
-    position. The power of a late clock is unknown for the duration of the delay.
+    position. The power of a late clock is unknown for the duration of the delay, and that of a
+    row without a covariate once its last value is six hours old.
 
     Raises
     ------
     DataError
-        A cause has no streaming version.
+        A cause has no streaming version, or follows a covariate that the rows do not have.
     """
 
     REMEMBERED = ('_temperature', '_follows')
 
-    def __init__(self, given: ExtendedModel, step_s: float) -> None:
+    def __init__(
+        self, given: ExtendedModel, step_s: float, covariates: tuple[str, ...] = ()
+    ) -> None:
         check_streams(given.model.active)
         self._given, self._step_s = given, step_s
+        own = tuple(a.cause.covariate for a in given.model.active if a.cause.covariate)
+        self._covariates = own, covariates
         self._model = given.model
         self.held = replace(given, on_top_of=None).held
         self._inputs = self._model.at(Stage.INPUT)
@@ -344,6 +416,7 @@ class ModelCorrector(Memory):
         self._reheaters = {a.name: Reheater(a, step) for a in self._shown if a.name == REHEATER}
         late = [a.values[0] for a in self._model.active if a.name == CLOCK]
         self._clock = LateClock(sum(late), step) if late else None
+        self._beside = Beside(*self._covariates)
         self._temperature = np.array([reference.temperature_degc])
         self._follows = np.array([np.iinfo(np.int64).min // 2, kernels.NO_DATA], dtype=np.int64)
 
@@ -371,7 +444,10 @@ class ModelCorrector(Memory):
 
     def _parts(self) -> list[Valve | Memory]:
         clock = [] if self._clock is None else [self._clock]
-        return [*self._valves, self._plain, self._extended, *self._reheaters.values(), *clock]
+        beside = [self._beside] if self._covariates[0] else []
+        return [
+            *self._valves, self._plain, self._extended, *self._reheaters.values(), *clock, *beside,
+        ]  # fmt: skip
 
     def correct(self, table: SampleTable) -> SampleTable:
         """Return the rows without the causes."""
@@ -389,6 +465,8 @@ class ModelCorrector(Memory):
                 scale = scale * part
             else:
                 u, factor = u * part, factor * part
+        for _, values in grids.covariates.values():
+            u = np.where(np.isfinite(values), u, np.nan)
         n = len(table)
         jumps, begin = self._beginnings(table.time_ns, u[:n])
         power = table.column(Signal.GENERATED_POWER).copy()
@@ -418,6 +496,10 @@ class ModelCorrector(Memory):
             command=v, u=u, scale=scale, pressure=p, temperature=temperature, time_s=time_s,
             usable=np.isfinite(u).astype(np.uint8), power=np.zeros(len(u)), scored=none,
             whole=none, sub=np.zeros(len(u), dtype=np.int64), reference=self._given.reference,
+            covariates={
+                name: (about, _padded(values))
+                for name, (about, values) in self._beside.feed(table).items()
+            },
         )  # fmt: skip
 
     def _beginnings(self, time_ns: IntArray, u: FloatArray) -> tuple[ByteArray, ByteArray]:
@@ -472,4 +554,4 @@ def _with(table: SampleTable, opening: FloatArray, power: FloatArray) -> SampleT
         values[:, signal] = column
         quality[~np.isfinite(column), signal] = Quality.BAD
         values[~np.isfinite(column), signal] = np.nan
-    return SampleTable(table.time_ns, values, quality)
+    return SampleTable(table.time_ns, values, quality, table.covariates)

@@ -16,7 +16,6 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
 from valveflow_ros.diagnosis.causes import check_covariates
-from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
@@ -28,7 +27,13 @@ from valveflow_ros.interface.files import Result, signed
 from valveflow_ros.interface.logs import Log, as_log, read_covariate
 from valveflow_ros.interface.models import Model, check_output, load_model, with_exponent
 from valveflow_ros.interface.monitor import recorded_history
-from valveflow_ros.interface.observation import Observed, corrected, observe_log, settings_of
+from valveflow_ros.interface.observation import (
+    Covariates,
+    Observed,
+    corrected,
+    observe_log,
+    settings_of,
+)
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
@@ -258,9 +263,9 @@ def _rows(
     try:
         observed = observe_log(log, settings, progress, earlier)
     except DataError as error:
-        step_s = settings.real('sample_period')
-        corrector = None if earlier is None else corrector_of(earlier, step_s)
-        blocks = aligned_blocks(Aligner(settings), log.readings, None, '')
+        columns = Covariates.of(log, earlier)
+        corrector = columns.corrector_of(earlier, settings)
+        blocks = columns.beside(aligned_blocks(Aligner(settings), log.readings, None, ''))
         table = gathered(corrected(blocks, corrector)).table
         needed = [info.signal for info in SIGNALS if info.required]
         if not len(table) or not all(np.isfinite(table.column(s)).any() for s in needed):

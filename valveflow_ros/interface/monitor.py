@@ -8,7 +8,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,14 @@ from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import minute
 from valveflow_ros.diagnosis.causes import check_covariates
-from valveflow_ros.diagnosis.corrector import corrector_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import Result
-from valveflow_ros.interface.logs import Log, as_log, read_covariate
+from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
-from valveflow_ros.interface.observation import check_signals
+from valveflow_ros.interface.observation import Covariates, check_signals
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
 from valveflow_ros.monitoring.alarm_state import AlarmChange, AlarmState
@@ -73,7 +72,6 @@ from valveflow_ros.report.words import (
     signed,
 )
 from valveflow_ros.signals.align import Aligner, aligned_blocks
-from valveflow_ros.signals.covariates import entry, held
 
 # Switches the diagnoses off: each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
@@ -450,20 +448,14 @@ def monitor(
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
     for sentence in (*told, *notes):
         progress.say(sentence)
-    corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
-    series = {name: read_covariate(log, name, said) for name, said in covariates.items()}
-    entries = tuple(entry(name, s.column, s.unit) for name, s in series.items())
-    aligner, engine = Aligner(settings), Monitor(settings, corrector, entries)
+    columns = Covariates.of(log, model, covariates)
+    corrector = columns.corrector_of(model, settings)
+    aligner, engine = Aligner(settings), Monitor(settings, corrector, columns.entries)
     events: list[Event] = [] if reference is None else engine.set_reference(reference)
     tables: list[SampleTable] = []
     tell = _progress_by_time(log, progress)
-    for aligned in aligned_blocks(aligner, log.readings, None, ''):
+    for aligned in columns.beside(aligned_blocks(aligner, log.readings, None, '')):
         tables.append(aligned.table)
-        if series:
-            rows_ns = aligned.table.time_ns
-            beside = [held(s.time_ns, s.values, rows_ns) for s in series.values()]
-            table = replace(aligned.table, covariates=np.column_stack(beside))
-            aligned = replace(aligned, table=table)
         events += feed_aligned(engine, aligned, lambda task: diagnose_window(task).text, tell)
         if len(aligned.table):
             tell(int(aligned.table.time_ns[-1]), '')

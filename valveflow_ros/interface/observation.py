@@ -13,13 +13,13 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.corrector import corrector_of
+from valveflow_ros.diagnosis.corrector import corrector_of, covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space, counted
 from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
 from valveflow_ros.fit.task import COARSE_STEP_S, FitTask
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.logs import Log
+from valveflow_ros.interface.logs import Log, Series, read_covariate
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
@@ -40,6 +40,7 @@ from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.words import duration
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
 from valveflow_ros.signals.align import Aligned, Aligner, aligned_blocks
+from valveflow_ros.signals.covariates import entry, held
 from valveflow_ros.signals.static_form import StaticForm
 
 _NEEDED = tuple(i for i in SIGNALS if i.required and i.topic != 'main_steam_temperature')
@@ -125,10 +126,12 @@ def observe(
     settings: Settings,
     progress: Callable[[float, str], None] = SILENT,
     corrector: Corrector | None = None,
+    covariates: Covariates | None = None,
 ) -> Observed:
     """Feed readings to a monitor and request a fit.
 
-    With a ``corrector`` its causes are removed from the rows before all other steps.
+    With a ``corrector`` its causes are removed from the rows before all other steps; it may need
+    ``covariates``.
 
     Raises
     ------
@@ -139,6 +142,7 @@ def observe(
     tables: list[SampleTable] = []
     resets = 0
     blocks = aligned_blocks(aligner, readings, progress, 'finding segments')
+    blocks = blocks if covariates is None else covariates.beside(blocks)
     for aligned in read_ahead(corrected(blocks, corrector)):
         resets += len(aligned.resets)
         tables.append(aligned.table)
@@ -178,8 +182,52 @@ def observe_log(
     check_address_space(WORKING_BYTES)
     if is_first_run():
         progress.say(SENTENCE)
-    corrector = None if model is None else corrector_of(model, settings.real('sample_period'))
-    return observe(log.readings, settings, shown or progress, corrector)
+    covariates = Covariates.of(log, model)
+    corrector = covariates.corrector_of(model, settings)
+    return observe(log.readings, settings, shown or progress, corrector, covariates)
+
+
+class Covariates:
+    """The further columns of a log that the rows need.
+
+    Parameters
+    ----------
+    series : dict
+        Column by the name of the covariate.
+    """
+
+    def __init__(self, series: dict[str, Series]) -> None:
+        self._series = series
+        self.entries = tuple(entry(name, s.column, s.unit) for name, s in series.items())
+
+    @classmethod
+    def of(
+        cls, log: Log, model: ExtendedModel | None, said: Mapping[str, str] | None = None
+    ) -> Covariates:
+        """Read the columns that a user names, and those that causes of a model follow.
+
+        Raises
+        ------
+        InputError
+            The log has no such column.
+        """
+        own = {n: f'{c.column}:{c.unit}' for n, c in covariates_of(model).items()}
+        wanted = {**own, **(said or {})}
+        return cls({name: read_covariate(log, name, theirs) for name, theirs in wanted.items()})
+
+    def corrector_of(self, model: ExtendedModel | None, settings: Settings) -> Corrector | None:
+        """Return the corrector of a model for rows with these columns; None without a model."""
+        if model is None:
+            return None
+        return corrector_of(model, settings.real('sample_period'), self.entries)
+
+    def beside(self, blocks: Iterator[Aligned]) -> Iterator[Aligned]:
+        """Yield the blocks with the values of the columns at their rows."""
+        for block in blocks:
+            rows_ns = block.table.time_ns
+            columns = [held(s.time_ns, s.values, rows_ns) for s in self._series.values()]
+            values = np.column_stack(columns) if columns else None
+            yield replace(block, table=replace(block.table, covariates=values))
 
 
 def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:

@@ -8,6 +8,7 @@ import json
 import os
 import stat
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+from valveflow_ros.signals.covariates import entries_of
 
 MODEL_FILE = 'model_file'
 ATTACHMENT = 'extended_model.json'
@@ -40,7 +42,7 @@ def given_model(settings: Settings) -> ExtendedModel | None:
 
     def parse(content: Any) -> ExtendedModel:
         given = result.model_from_json(content)
-        corrector_of(given, settings.real('sample_period'))
+        corrector_of(given, settings.real('sample_period'), entries_of(settings))
         return given
 
     model: ExtendedModel | None = _given(settings, MODEL_FILE, 'a model', parse)
@@ -63,7 +65,7 @@ def corrector_for(given: ExtendedModel | None, settings: Settings) -> Corrector 
     """Return the compiled corrector of a model, None without a model; also used in a replay."""
     if given is None:
         return None
-    corrector = corrector_of(given, settings.real('sample_period'))
+    corrector = corrector_of(given, settings.real('sample_period'), entries_of(settings))
     period_ns = round(settings.real('sample_period') * NS_PER_S)
     rows = SampleTable.from_columns(
         given.start_ns + period_ns * np.arange(_FEW, dtype=np.int64),
@@ -74,6 +76,8 @@ def corrector_for(given: ExtendedModel | None, settings: Settings) -> Corrector 
             Signal.GENERATED_POWER: np.full(_FEW, 200.0),
         },
     )
+    beside = np.zeros((_FEW, len(entries_of(settings))))
+    rows = replace(rows, covariates=beside)
     # Compile the loops or load them from the cache now, so that no sample waits for them.
     corrector.correct(rows)
     corrector.restart()
