@@ -7,9 +7,10 @@ Run: ``python -m benchmarks.monitor_study --seeds 10 --first 431`` for healthy u
 three times as large as by default; ``--effect all`` takes each effect of the catalogue, one at a
 time. Units are those of ``plant/thermal_unit.py``, and ``paper`` the one of the paper, all as
 means over a minute. ``--wear 1 --days 365`` lets each unit lose so many MW a month from the first
-day on, of what it gives in the mean. The monitor runs over the record without diagnoses, with the
-defaults of its parameters; what was set there by looking at such units was set on seeds 421 to
-430.
+day on, of what it gives in the mean. With ``--vacuum 10`` the first ten days are diagnosed with
+the condenser pressure as a covariate, and the monitor gets the model of that diagnosis. It runs
+over the record without diagnoses, with the defaults of its parameters; what was set there by
+looking at such units was set on seeds 421 to 430.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def effect_at(effect: Effect, times: float) -> str:
 
 
 def row_of(
-    seed: int, kind: str, days: float, effect: str = '', wear: float = 0.0
+    seed: int, kind: str, days: float, effect: str = '', wear: float = 0.0, vacuum: float = 0.0
 ) -> dict[str, Any]:
     """Run the monitor over one unit; return what it told."""
     record = record_of(kind, seed, days, [])
@@ -70,7 +71,12 @@ def row_of(
     if effect:
         record = joined(record, record_of(kind, seed, days, [effect]))
     begin = time.process_time()
-    found = vf.monitor(record, diagnose=False)
+    model = None
+    if vacuum:
+        first = record[record['time'] < record['time'].iloc[0] + pd.Timedelta(days=vacuum)]
+        diagnosed = vf.diagnose(first, covariates={'vacuum': 'condenser_pressure_kpa'})
+        model = diagnosed.extended_model if diagnosed.diagnosis.causes else None
+    found = vf.monitor(record, diagnose=False, model=model)
     content = found.to_json()
 
     def day(time_ns: int) -> float:
@@ -89,6 +95,7 @@ def row_of(
     return {
         'kind': kind, 'seed': seed, 'effect': effect, 'alarms': alarms,
         'reference_day': None if reference is None else day(reference['set']),
+        'held': [] if model is None else list(model.model.names),
         'wear': content['wear'] and round(content['wear']['mw_per_month'], 3),
         'curves': len(content['curves']), 'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
@@ -121,6 +128,7 @@ def main() -> None:
     parser.add_argument('--kinds', default='choked,sequence,paper')
     parser.add_argument('--effect', action='append', default=[])
     parser.add_argument('--wear', type=float, default=0.0)
+    parser.add_argument('--vacuum', type=float, default=0.0)
     given = parser.parse_args()
     onset_days = 0.5 * given.days if given.effect else 0.0
     rows: list[dict[str, Any]] = []
@@ -130,10 +138,18 @@ def main() -> None:
         chosen = [e for e in named if e.name in given.effect or 'all' in given.effect]
         effects = [effect_at(e, given.times) for e in chosen] if given.effect else ['']
         for effect in effects:
-            work = partial(row_of, kind=kind, days=given.days, effect=effect, wear=given.wear)
+            work = partial(
+                row_of,
+                kind=kind,
+                days=given.days,
+                effect=effect,
+                wear=given.wear,
+                vacuum=given.vacuum,
+            )
             rows += study.rows_of(work, study.seeds(given.first, given.seeds))
     what = f'wear_{given.wear:g}' if given.wear else 'healthy'
     what = f'{"_".join(given.effect)}_times_{given.times:g}' if given.effect else what
+    what += '_vacuum' if given.vacuum else ''
     groups = {r['kind']: [s for s in rows if s['kind'] == r['kind']] for r in rows}
     study.keep(
         study.name_of(f'monitor_{what}', given.first, given.seeds),
