@@ -189,6 +189,10 @@ PAIRS = (
     ('backlash', 'gain_drift'), ('temperature', 'gain_step'), ('diurnal', 'backlash'),
     ('exponent', 'input_step'), ('curve_shape', 'gain_drift'), ('rate_limit', 'temperature'),
 )  # fmt: skip
+TRIPLES = (
+    ('backlash', 'gain_drift', 'temperature'), ('temperature', 'gain_step', 'diurnal'),
+    ('exponent', 'backlash', 'input_step'), ('curve_shape', 'gain_drift', 'rate_limit'),
+)  # fmt: skip
 
 
 def _unit(rng: np.random.Generator) -> UnitDescription:
@@ -202,7 +206,7 @@ def hidden(names: tuple[str, ...], seed: int, days: float, times: tuple[float, f
     setting = Setting(rng, _unit(rng), days, *times)
     effects = tuple(EffectSpec.parse(EFFECTS[name](setting)) for name in names)
     return Case(
-        'hidden' if len(names) == 1 else 'pair', '+'.join(names), seed, setting.unit, effects,
+        ('hidden', 'pair', 'triple')[len(names) - 1], '+'.join(names), seed, setting.unit, effects,
         names, given='region_lag' in names,
     )  # fmt: skip
 

@@ -26,6 +26,7 @@ from benchmarks.diagnosis_cases import (
     CONFOUNDED,
     EFFECTS,
     PAIRS,
+    TRIPLES,
     Case,
     confounded,
     hidden,
@@ -46,7 +47,7 @@ from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.records import IntArray
 from valveflow_ros.signals.static_form import StaticForm
 
-KINDS = ('hidden', 'null', 'pair', 'confounded', 'outside', 'slow')
+KINDS = ('hidden', 'null', 'pair', 'triple', 'confounded', 'outside', 'slow')
 # Four fifths of 64, which is four times the 16 that just reach detection.
 ENOUGH = 51.0
 OTHER_SEED = 1_000_003  # of the record that an earlier model comes from
@@ -197,8 +198,9 @@ def cases(args: argparse.Namespace) -> list[Case]:
         return [slow(label, seed) for seed in seeds for label in SLOW]
     if args.kind == 'confounded':
         return [confounded(c, seed, args.days, times) for seed in seeds for c in CONFOUNDED]
-    if args.kind == 'pair':
-        return [hidden(pair, seed, args.days, times) for seed in seeds for pair in PAIRS]
+    if args.kind in ('pair', 'triple'):
+        sets = PAIRS if args.kind == 'pair' else TRIPLES
+        return [hidden(names, seed, args.days, times) for seed in seeds for names in sets]
     names = args.effect or list(EFFECTS)
     return [hidden((name,), seed, args.days, times) for seed in seeds for name in names]
 
