@@ -53,6 +53,7 @@ def truth(plant):
 @needs_jit
 def test_the_vacuum_is_named_with_its_size(plant, diagnosed, without):
     d = diagnosed.diagnosis
+    assert any(n.startswith('Curve and alarms can leave out vacuum: give') for n in d.notes)
     (found,) = (c for c in d.causes if c.name == 'vacuum')
     b = found.parameters['b']
     assert b.unit == 'MW/kPa'

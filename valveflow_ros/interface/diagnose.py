@@ -46,6 +46,10 @@ _TRY_A_COLUMN = (
     'A further signal of the table may explain the slow variation, such as the condenser '
     'pressure: try --covariate NAME=COLUMN[:UNIT] on the table itself.'
 )
+_TAKE_IT_OUT = (
+    'Curve and alarms can leave out {}: give the extended_model.json of this diagnosis to '
+    'identify --model and monitor --model, or to the node as model_file.'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +229,8 @@ def diagnose(
     kept = () if log.compression is None else (log.compression.sentence,)
     if found.disturbance is not None and not beside:
         notes.append(_TRY_A_COLUMN)
+    if followed := [c.name for c in beside if c.name in {n.name for n in found.causes}]:
+        notes.append(_TAKE_IT_OUT.format(' and '.join(followed)))
     signatures, answers, maps = views(record, found)
     found = replace(found, notes=(*log.contents.warnings, *kept, *notes, *found.notes))
     found = found.measured_in(settings.output_unit)
