@@ -61,6 +61,14 @@ def test_a_part_of_a_log_is_taken_by_its_times(run, logs, tmp_path):
     window = json.loads(ran.out)['window']
     assert window['start_ns'] == pd.Timestamp(start).value
     assert window['end_ns'] == pd.Timestamp(end).value
+    again = run(*words, tmp_path / 'a', '--from', start, '--to', end)
+    assert 'was replaced' not in again.out  # it is the same curve
+    anew = run(*words, tmp_path / 'a', '--to', end, '--time-zone', '+01:00')
+    replaced = (
+        'The curve of 2023-11-15 03:00:00 UTC+01:00 to 2023-11-15 09:00:00 UTC+01:00 '
+        f'(model {ran.json["model_id"]}) that was in characteristic.json was replaced.'
+    )
+    assert replaced in anew.out
     none = run(*words, tmp_path / 'b', '--from', '2030-01-01')
     assert 'has no readings between these times' in none.refused()
     wrong = run(*words, tmp_path / 'b', '--to', 'noon')

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from logged import values
 
+import valveflow_ros as vf
+from valveflow_ros.interface.logs import read_covariate
 from valveflow_ros.logs import open_log
 from valveflow_ros.records import SIGNALS, Signal
 
@@ -188,3 +190,59 @@ def test_a_column_that_gives_way_to_a_constant_is_not_used(run, tmp_path, write_
     assert 'the constant is used instead' in ran.err
     assert 'Not used: main_steam_pressure_mpa.' in ran.out
     assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == [9.0] * 5
+
+
+def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_csv):
+    def row(k):
+        return f'{1700000000 + k},50,13,540,200,{5 + 0.01 * (k % 7)},{k},fixed'
+
+    mine = [row(k) for k in (*range(20, 40), *range(20), 5)]
+    table = write_csv(
+        'time,valve_opening,main_steam_pressure,main_steam_temperature,generated_power,'
+        'Vacuum [kPa],temperature,Spare', mine,
+    )  # fmt: skip
+    ran = run('import', table, '-o', tmp_path / 'without.mcap')
+    assert ran.status == 0, ran.err
+    assert (
+        'Of these Vacuum [kPa], temperature hold numbers; if the power may follow one of them, '
+        "keep it with --covariate 'vacuum=Vacuum [kPa]'." in ran.out
+    )
+    log = tmp_path / 'x.mcap'
+    ran = run('import', table, '-o', log, '--covariate', 'vacuum=Vacuum', '--json')
+    assert ran.status == 0, ran.err
+    assert ran.json['ignored'] == ['temperature', 'Spare']
+    (kept,) = ran.json['covariates']
+    assert (kept['name'], kept['unit'], kept['low'], kept['high']) == ('vacuum', 'kPa', 5.0, 5.06)
+    series = read_covariate(vf.open_log(log), 'vacuum', 'vacuum')
+    assert series.unit == 'kPa'
+    assert (np.diff(series.time_ns) >= 0).all()
+    assert np.allclose(series.at(series.time_ns[0] + np.arange(40) * 10**9)[7:9], [5.0, 5.01])
+    assert len(values(log, Signal.GENERATED_POWER)) == 40
+    ran = run('import', table, '-o', tmp_path / 'y.mcap', '--covariate', 'vacuum=Vacuum [kPa]')
+    assert 'Of these temperature holds numbers' in ran.out
+    assert '--covariate further_temperature=temperature.' in ran.out  # a cause has the other name
+
+
+@pytest.mark.parametrize(
+    ('said', 'told'),
+    [
+        ('vacuum=nothing', "--covariate vacuum: {table} has no column or topic 'nothing'"),
+        ('valve_command=Spare', "'valve_command' is the name of a signal; choose another name"),
+        ('gain_drift=Spare', 'is a cause of the catalogue already; choose another name'),
+    ],
+)
+def test_a_further_column_that_cannot_be_kept(run, tmp_path, history, said, told):
+    ran = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS, '--covariate', said)
+    assert ran.status != 0
+    assert told.format(table=history) in ran.err
+
+
+def test_a_table_has_no_place_for_a_further_column(run, tmp_path, history):
+    ran = run('import', history, '-o', tmp_path / 'x.csv', *OPTIONS, '--covariate', 'v=Spare')
+    assert ran.status == 2
+    assert '--covariate needs a recording as output' in ran.err
+
+
+def test_the_command_after_a_refusal_keeps_the_further_column(run, tmp_path, history):
+    ran = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS[:-2], '--covariate', 'v=MW')
+    assert '--covariate v=MW' in ran.err

@@ -325,12 +325,13 @@ def log_of(options: Namespace, mapping: LogMapping, console: Console) -> Log:
     return open_log(options.log, mapping, progress=console).between(start, end)
 
 
-def add_covariate(parser: ArgumentParser) -> None:
+def add_covariate(
+    parser: ArgumentParser, what: str = 'a column beside the signals that the power may follow'
+) -> None:
     """Add the option for columns that a diagnosis tries as causes."""
     parser.add_argument(
         '--covariate', action='append', default=[], metavar='NAME=COLUMN[:UNIT]',
-        help='a column beside the signals that the power may follow, such as '
-        'vacuum=condenser_pressure_kpa; may be given several times',
+        help=f'{what}, such as vacuum=condenser_pressure_kpa; may be given several times',
     )  # fmt: skip
 
 

@@ -44,7 +44,8 @@ from valveflow_ros.signals.static_form import StaticForm
 
 _TRY_A_COLUMN = (
     'A further signal of the table may explain the slow variation, such as the condenser '
-    'pressure: try --covariate NAME=COLUMN[:UNIT] on the table itself.'
+    'pressure: try --covariate NAME=COLUMN[:UNIT] (a recording has it as a topic if import had '
+    'this option too).'
 )
 _TAKE_IT_OUT = (
     'Curve and alarms can leave out {}: give the extended_model.json of this diagnosis to '

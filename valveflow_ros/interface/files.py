@@ -276,6 +276,11 @@ class Result:
         content: dict[str, Any] = json.loads(next(iter(self._told().values())))
         return content
 
+    def _replaced(self, folder: Path) -> str:
+        """Return a sentence about an earlier result that is lost by writing; empty if none."""
+        del folder
+        return ''
+
     def _told(self) -> dict[str, str]:
         """Return the files with their sentences in the unit of the output; models have none."""
         from valveflow_ros.signals.units import in_unit
@@ -355,13 +360,14 @@ class Result:
             plotly is not installed; or pictures are requested without matplotlib; or unknown zone.
         """
         from valveflow_ros.records import zone_of
+        from valveflow_ros.report.words import in_zone
 
         folder, zone = Path(folder), zone_of(time_zone)
         check_results(folder, figures, tables)
         page = self.page().in_unit(self.output_unit)
         local = page.in_zone(zone)
         content = {**self._told(), REPORT: local.to_html()}
-        backup = back_up(folder, self.verb, content)
+        backup, lost = back_up(folder, self.verb, content), in_zone(self._replaced(folder), zone)
         files = write_texts(folder, content)
         *most, last = [str(files[REPORT]), *(name for name in content if name != REPORT)]
         lines = [f'Wrote {", ".join(most)} and {last}.']
@@ -387,7 +393,7 @@ class Result:
         if beside:
             told = ' and '.join(f'{what} in {place}' for what, (place, _) in beside.items())
             lines.append(f'Wrote {told}.')
-        lines.append(backup.words())
+        lines += [backup.words(), lost]
         if replaced and REPORT in backup.names:
             lines.append(
                 f'{", ".join(replaced)}: what was there showed something else and is replaced.'

@@ -23,7 +23,7 @@ from valveflow_ros.fit.static_test import find_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import Result, signed
+from valveflow_ros.interface.files import Result, signed, writer
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import (
     check_output,
@@ -46,9 +46,11 @@ from valveflow_ros.report.answer import doubt
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
+from valveflow_ros.report.words import period
 from valveflow_ros.signals.align import align_whole
 from valveflow_ros.signals.units import in_unit
 
+CURVE = 'characteristic.json'
 STEP_TEST_ADVICE = (
     'This looks like a manual step test (few openings, each held): --step-test identifies it '
     'from its steady states.'
@@ -103,13 +105,27 @@ class Identification(Result):
         """Return the report."""
         return identification_page(self.data)
 
+    def _replaced(self, folder: Path) -> str:
+        path = folder / CURVE
+        if writer(path) != self.verb:  # then it is kept
+            return ''
+        try:
+            content = json.loads(path.read_text(encoding='utf-8'))
+            model, window = str(content['model_id']), content['window']
+            when = period(int(window['start_ns']), int(window['end_ns']))
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
+            return f'An earlier {CURVE} that was there was replaced.'
+        if model == self.characteristic.model_id:
+            return ''
+        return f'The curve of {when} (model {model}) that was in {CURVE} was replaced.'
+
     def texts(self) -> dict[str, str]:
         """Return ``characteristic.json``; with a reference also ``shift.json``.
 
         With a model also the extended model with the new curve.
         """
         c = self.characteristic
-        contents = {'characteristic.json': to_json(c)}
+        contents = {CURVE: to_json(c)}
         if self.data.shift is not None:
             contents['shift.json'] = shift_json(self.data.shift)
         files = {

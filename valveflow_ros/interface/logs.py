@@ -329,20 +329,32 @@ def read_covariate(log: Log, name: str, said: str) -> Series:
     InputError
         There is no such column, or it contains no number.
     """
+    return read_series(log.source, log.mapping, log.name, name, said)
+
+
+def read_series(source: Any, mapping: LogMapping, log: str, name: str, said: str) -> Series:
+    """Read a further column of a file or DataFrame; see `read_covariate`.
+
+    ``log`` is the name of the file in messages.
+    """
     theirs, colon, told = said.rpartition(':')
-    contents = _column_of(log, theirs.strip()) if colon and theirs else None
+    contents = _column_of(source, mapping, theirs.strip()) if colon and theirs else None
     if contents is None:  # a column's name may itself contain a colon
         theirs, told = said, ''
-        contents = _column_of(log, theirs.strip())
+        contents = _column_of(source, mapping, theirs.strip())
     if contents is None:
-        raise InputError(f"--covariate {name}: {log.name} has no column or topic '{said}'.")
+        raise InputError(f"--covariate {name}: {log} has no column or topic '{said}'.")
     mine = contents.readings.signal == _READ_AS
     good = mine & np.isfinite(contents.readings.value) & (contents.readings.quality < Quality.BAD)
     if not good.any():
-        raise InputError(f"--covariate {name}: '{theirs}' of {log.name} holds no number.")
+        raise InputError(f"--covariate {name}: '{theirs}' of {log} holds no number.")
     times, values = contents.readings.time_ns[good], contents.readings.value[good]
     order = np.argsort(times, kind='stable')
-    return Series(theirs.strip(), told.strip() or _unit_in(theirs), times[order], values[order])
+    theirs = theirs.strip()
+    # A column may be named without the unit in its heading.
+    named = _unit_in(contents.signals.get(_READ_AS, theirs))
+    unit = told.strip() or _unit_kept(contents, theirs) or named
+    return Series(theirs, unit, times[order], values[order])
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,17 +405,26 @@ _GAP_S, _GAP_STEPS = 3600.0, 5.0
 _READ_AS = Signal.VALVE_COMMAND
 
 
-def _column_of(log: Log, theirs: str) -> LogContents | None:
+def _column_of(source: Any, mapping: LogMapping, theirs: str) -> LogContents | None:
     """Return the log with the column read as a signal; None if there is no such column."""
     topics = [info.topic for info in SIGNALS]
-    times = {k: v for k, v in log.mapping.names().items() if k not in topics}
+    times = {k: v for k, v in mapping.names().items() if k not in topics}
     names = {**times, SIGNALS[_READ_AS].topic: theirs}
     try:
-        if hasattr(log.source, 'columns'):
-            return _from_dataframe(log.source, names)
-        return read_file(log.source, columns=names, absent=topics, table=log.mapping.table)
+        if hasattr(source, 'columns'):
+            return _from_dataframe(source, names)
+        return read_file(source, columns=names, absent=topics, table=mapping.table)
     except InputError:
         return None
+
+
+def _unit_kept(contents: LogContents, topic: str) -> str:
+    """Return the unit that an imported log lists for a covariate, '' if there is none."""
+    try:
+        rows = json.loads(contents.attachments['import.json'])['covariates']
+        return next(str(row['unit']) for row in rows if row['name'] == topic.lstrip('/'))
+    except (KeyError, ValueError, TypeError, AttributeError, StopIteration):
+        return ''
 
 
 def _unit_in(column: str) -> str:

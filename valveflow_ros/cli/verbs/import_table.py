@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import os
+import re
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +15,10 @@ from valveflow_ros.cli.command import (
     Console,
     TableOption,
     VerbResult,
+    add_covariate,
     add_mapping,
     columns,
+    covariates_of,
     mapping_of,
     time_ns,
 )
@@ -48,6 +52,8 @@ and with columns whose names say nothing:
 _OPCUA = 'opcua://'
 _HEAD = ('your column', 'is', 'why', 'in', 'runs from', '', '')
 _FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
+# Columns named in a sentence.
+_NAMED = 3
 # The table shows that one of these is needed, but not which one.
 _CHOICES = ('time-zone', 'date-order', 'decimal', 'sheet')
 
@@ -68,6 +74,9 @@ def arguments(parser: ArgumentParser) -> None:
         '--dry-run', action='store_true', help='show what was understood and write nothing'
     )
     add_mapping(parser)
+    add_covariate(
+        parser, 'a further column to keep as the topic NAME, for diagnose and monitor --covariate'
+    )
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')
     historian = parser.add_argument_group('history of an OPC UA server')
     historian.add_argument(
@@ -91,21 +100,27 @@ def run(options: Namespace, console: Console) -> VerbResult:
             'Name the log to write with -o LOG.mcap, or add --dry-run to write nothing.'
         )
     from valveflow_ros.interface import SILENT
-    from valveflow_ros.interface.files import check_log
+    from valveflow_ros.interface.files import TABLES, check_log
     from valveflow_ros.interface.importing.table_import import TableImport
     from valveflow_ros.interface.mapping import LOOKING_ON, gather_refusals
     from valveflow_ros.logs.tables.refusal import RefusedError
 
+    covariates = _further(options)
     if options.output is not None:
+        if covariates and options.output.suffix.lower() in TABLES:
+            raise UsageError('--covariate needs a recording as output, such as -o LOG.mcap.')
         check_log(options.output, source=options.table, overwrite=options.overwrite)
 
     def again(said: LogMapping) -> None:
         console(0.1, LOOKING_ON)
-        TableImport(options.table, said, SILENT, strict=True).read(None)
+        TableImport(options.table, said, SILENT, covariates=covariates, strict=True).read(None)
 
     try:
         return gather_refusals(
-            options.table, lambda said: _imported(options, said, console), mapping, again
+            options.table,
+            lambda said: _imported(options, said, covariates, console),
+            mapping,
+            again,
         )
     except RefusedError as refused:
         raise InputError(_refusal(refused, options)) from None
@@ -121,7 +136,7 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
         raise UsageError(
             'The history of a server wants --mapping FILE, --from TIME, --to TIME and -o LOG.'
         )
-    if options.constant or options.column or options.dry_run:
+    if options.constant or options.column or options.covariate or options.dry_run:
         raise UsageError('The mapping file says all about the nodes: no --column or the like.')
     from valveflow_ros.opcua.session import OpcUaHistory, check_installed
 
@@ -149,11 +164,25 @@ def _from_history(options: Namespace, console: Console) -> VerbResult:
     )  # fmt: skip
 
 
-def _imported(options: Namespace, mapping: LogMapping, console: Console) -> VerbResult:
+def _further(options: Namespace) -> dict[str, str]:
+    """Return the columns to keep by topic; raises `UsageError` and `InputError`."""
+    from valveflow_ros.diagnosis.causes import check_covariates
+    from valveflow_ros.records import SIGNALS
+
+    covariates = covariates_of(options)
+    check_covariates(covariates)
+    for name in covariates.keys() & {info.topic for info in SIGNALS}:
+        raise InputError(f"--covariate '{name}' is the name of a signal; choose another name.")
+    return covariates
+
+
+def _imported(
+    options: Namespace, mapping: LogMapping, covariates: dict[str, str], console: Console
+) -> VerbResult:
     from valveflow_ros.interface.importing.table_import import Spool, TableImport
 
     console(0.05, 'looking at the table')
-    table = TableImport(options.table, mapping, console)
+    table = TableImport(options.table, mapping, console, covariates=covariates)
     console(0.1, 'reading')
     place, last = None, 'Nothing was written (--dry-run).'
     if options.dry_run:
@@ -189,7 +218,7 @@ def _written(options: Namespace, table: TableImport) -> Path:
         return write_readings(
             table.readings(), table.signals, path,
             attachments={'import.json': table.as_json().encode()},
-            overwrite=options.overwrite or is_empty(path),
+            overwrite=options.overwrite or is_empty(path), further=list(table.further),
         ).path  # fmt: skip
     if table.is_long:
         raise DataError(
@@ -224,6 +253,9 @@ def _understood(table: TableImport) -> list[str]:
         lost = f'{counted(s.missing, "value")} missing' if s.missing else ''
         span = f'{plain(s.low)} to {plain(s.high)}'
         rows.append([s.column, s.topic, s.ground or '', taken, span, s.unit, lost])
+    for name, series in table.further.items():
+        low, high = plain(float(series.values.min())), plain(float(series.values.max()))
+        rows.append([series.column, name, 'covariate', '', f'{low} to {high}', series.unit, ''])
     lines = [
         f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
         f'Times: {table.time_words}; zone: {zone}.',
@@ -237,6 +269,8 @@ def _understood(table: TableImport) -> list[str]:
             lines.append(f'Not numbers in {source.column}: {", ".join(told)}.')
     if table.ignored:
         lines.append(f'Not used: {", ".join(table.ignored)}.')
+    if table.numeric_ignored:
+        lines.append(_left_out(table.numeric_ignored))
     if table.duplicates:
         were = 'was' if table.duplicates == 1 else 'were'
         lines.append(
@@ -250,6 +284,25 @@ def _understood(table: TableImport) -> list[str]:
             f'from {moment(longest.start_ns)}.'
         )
     return lines
+
+
+def _left_out(names: Sequence[str]) -> str:
+    """Return a sentence about columns of numbers that were left out, and the option for one."""
+    from valveflow_ros.diagnosis.causes import catalogue
+    from valveflow_ros.logs.tables.refusal import quoted
+    from valveflow_ros.logs.tables.words import folded, split_unit
+    from valveflow_ros.records import SIGNALS
+
+    several = len(names) > 1
+    topic = re.sub(r'\W+', '_', folded(split_unit(names[0])[0]), flags=re.ASCII).strip('_')[:30]
+    if not topic[:1].isalpha() or topic in {*catalogue(), *(info.topic for info in SIGNALS)}:
+        topic = f'further_{topic}'
+    example = quoted(f'{topic}={names[0]}')
+    listed = ', '.join(names[:_NAMED]) + (', ...' if len(names) > _NAMED else '')
+    return (
+        f'Of these {listed} {"hold" if several else "holds"} numbers; if the power may follow '
+        f'{"one of them" if several else "it"}, keep it with --covariate {example}.'
+    )
 
 
 def _refusal(refused: RefusedError, options: Namespace) -> str:
@@ -271,7 +324,7 @@ def _refusal(refused: RefusedError, options: Namespace) -> str:
 
 def _command(refused: RefusedError, options: Namespace) -> str:
     """Return the given command with the missing options added."""
-    from valveflow_ros.logs.tables.refusal import Remedy
+    from valveflow_ros.logs.tables.refusal import Remedy, quoted
 
     given = [
         Remedy(said.option, said.value)
@@ -286,6 +339,7 @@ def _command(refused: RefusedError, options: Namespace) -> str:
         words += ['-o', _quoted(options.output)]
     words += [f'--{name.replace("_", "-")}' for name in _FLAGS if getattr(options, name, False)]
     words += [str(old) for old in given if _subject(old) not in new]
+    words += [f'--covariate {quoted(said)}' for said in options.covariate]
     return ' '.join([*words, refused.options])
 
 

@@ -57,9 +57,10 @@ def covariate_cause(about: Covariate) -> Cause:
 
     def sentence(values: SentenceValues) -> str:
         b, per = values['b'], about.unit or 'unit'
+        column = name if about.column.lstrip('/') == name else f'{about.column} ({name})'
         return (
             f'The power {"rises" if b > 0.0 else "falls"} by {abs(b):.2g} MW for every {per} that '
-            f'{about.column} ({name}) is higher, at a load of {about.power_mw:.0f} MW.'
+            f'{column} is higher, at a load of {about.power_mw:.0f} MW.'
         )
 
     def hindered(grids: Grids) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.interface import Progress
 from valveflow_ros.interface.files import reason
+from valveflow_ros.interface.logs import Series, read_series
 from valveflow_ros.interface.mapping import LogMapping, merge_refusals
 from valveflow_ros.interface.plausibility import (
     air_note,
@@ -34,6 +35,7 @@ from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.reader import RawBlock, TableReader
 from valveflow_ros.logs.tables.refusal import RefusedError
 from valveflow_ros.logs.tables.table import order_note
+from valveflow_ros.logs.tables.words import split_unit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     SIGNALS,
@@ -164,6 +166,8 @@ class TableImport:
         What the user specified about the table.
     progress : Progress
         Receives the interpretation of the table and the warnings.
+    covariates : mapping of str to str
+        Further columns to keep, by the topic: ``COLUMN`` or ``COLUMN:unit``.
     strict : bool
         Also refuse a column that the user named without a unit if its values contradict the
         usual unit; otherwise only warn.
@@ -179,8 +183,10 @@ class TableImport:
         First and last time, ns since 1970.
     gaps : list of Gap
         The longest first.
-    ignored : tuple of str
-        Columns that were not used.
+    ignored, numeric_ignored : tuple of str
+        Columns that were not used; those of them that hold different numbers.
+    further : dict of str to Series
+        The covariates by topic; complete when the table was read.
     notes : tuple of str
         Sentences of the reader.
     time_zone, time_words : str
@@ -195,7 +201,13 @@ class TableImport:
     """
 
     def __init__(
-        self, path: Path, mapping: LogMapping, progress: Progress, *, strict: bool = False
+        self,
+        path: Path,
+        mapping: LogMapping,
+        progress: Progress,
+        *,
+        covariates: Mapping[str, str] | None = None,
+        strict: bool = False,
     ) -> None:
         if path.suffix.lower() not in TABLE_SUFFIXES:
             raise RecordingError(path, 'is no .csv, .xlsx or .parquet table')
@@ -203,6 +215,8 @@ class TableImport:
         self._reader = mapping.open_with(
             lambda names: TableReader(path, names, list(mapping.constants), mapping.table)
         )
+        self._covariates = covariates or {}
+        self.further: dict[str, Series] = {}
         self._constants = mapping.constant_signals
         names = self._reader.names
         told = {_BY_COLUMN[n].signal: unit for n, unit in self._reader.units.items()}
@@ -229,6 +243,7 @@ class TableImport:
         self.notes: tuple[str, ...] = ()
         self.time_zone, self.time_words = '', ''
         self.is_long = self._reader.long is not None
+        self.numeric_ignored: tuple[str, ...] = ()
         for name in (n for n in names if n not in self._used):
             progress.warn(
                 f"{_BY_COLUMN[name].topic} stands in the table as '{names[name]}' too; the "
@@ -284,6 +299,7 @@ class TableImport:
                 f'{uncertain} values are marked uncertain; a plain recording has no place for '
                 'that mark, they stand there as good.'
             )
+        self._read_further()
         self.notes = (*reader.understood(), *notes)
         self.time_zone, self.time_words = reader.time_zone, reader.time_words
 
@@ -295,7 +311,13 @@ class TableImport:
             yield SampleTable.from_columns(time_ns, columns, quality)
 
     def readings(self) -> Iterator[Readings]:
-        """Yield the values one by one in chronological order, in the engine's units."""
+        """Yield the values one by one in chronological order, in the engine's units.
+
+        Those of the covariates have the numbers that follow those of the signals.
+        """
+        yield from _merged(self._readings(), list(self.further.values()))
+
+    def _readings(self) -> Iterator[Readings]:
         if not self.is_long:
             yield from map(table_to_readings, self.tables())
             return
@@ -353,6 +375,17 @@ class TableImport:
             'time_zone': self.time_zone,
             'gaps': len(self.gaps),
             'signals': [asdict(source) for source in self.sources()],
+            'covariates': [
+                {
+                    'name': name,
+                    'column': series.column,
+                    'unit': series.unit,
+                    'low': float(series.values.min()),
+                    'high': float(series.values.max()),
+                    'values': len(series.values),
+                }
+                for name, series in self.further.items()
+            ],
             'ignored': list(self.ignored),
             'notes': list(self.notes),
         }
@@ -365,6 +398,16 @@ class TableImport:
             for s in content['signals']
         ]
         return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
+
+    def _read_further(self) -> None:
+        path = self._reader.path
+        for name, said in self._covariates.items():
+            self._progress(0.6, f'reading {name}')
+            self.further[name] = read_series(path, self._mapping, str(path), name, said)
+        kept = {series.column for series in self.further.values()}
+        kept |= {n for n in self.ignored if split_unit(n)[0] in kept}
+        self.ignored = tuple(name for name in self.ignored if name not in kept)
+        self.numeric_ignored = tuple(n for n in self._reader.numeric_ignored if n not in kept)
 
     def _sort(self) -> list[str]:
         """Sort the rows by time; a long table may repeat a time, another table may not."""
@@ -447,3 +490,35 @@ class TableImport:
         refuse_impossible(reader.path, doubts, names)
         for found in doubts:
             self._progress.warn(found.advice(names[found.signal]))
+
+
+def _merged(blocks: Iterable[Readings], further: list[Series]) -> Iterator[Readings]:
+    """Yield the blocks with the further columns merged, in chronological order."""
+    done = [0] * len(further)
+
+    def upto(end_ns: int | None) -> Iterator[Readings]:
+        for k, series in enumerate(further):
+            end = len(series.time_ns)
+            if end_ns is not None:
+                end = int(np.searchsorted(series.time_ns, end_ns, side='right'))
+            part, done[k] = slice(done[k], end), end
+            n = len(series.time_ns[part])
+            yield Readings(
+                series.time_ns[part], np.full(n, len(SIGNALS) + k, np.int8), series.values[part],
+                np.full(n, Quality.GOOD, np.uint8),
+            )  # fmt: skip
+
+    for block in blocks:
+        parts = [block, *(upto(int(block.time_ns[-1])) if len(block) else ())]
+        yield _in_order(parts) if further else block
+    if further:
+        yield _in_order(list(upto(None)))
+
+
+def _in_order(parts: list[Readings]) -> Readings:
+    columns = [
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ('time_ns', 'signal', 'value', 'quality')
+    ]
+    order = np.argsort(columns[0], kind='stable')
+    return Readings(*(column[order] for column in columns))

@@ -8,7 +8,7 @@ array, which is fast to build.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -125,6 +125,7 @@ def write_readings(
     metadata: Metadata | None = None,
     definitions: Definitions | None = None,
     overwrite: bool = False,
+    further: Sequence[str] = (),
 ) -> WrittenLog:
     """Write readings block by block; otherwise as `write_samples`.
 
@@ -134,17 +135,20 @@ def write_readings(
         In time order, within each block and across blocks.
     signals : collection of Signal
         The signals that occur; required signals have a topic in any case.
+    further : sequence of str
+        Topics of further columns, whose readings have the numbers that follow those of the
+        signals.
     """
     place = Path(path)
     target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'
     if target.exists() and not overwrite:
         raise RecordingError(target, 'exists already')
     book = TopicRegistry(definitions or Definitions())
-    channels = np.zeros(len(SIGNALS), dtype=np.uint16)
-    for info in SIGNALS:
-        if info.required or info.signal in signals:
-            channels[info.signal] = len(book.ids) + 1
-            book.add(f'{prefix.rstrip("/")}/{info.topic}', FLOAT64)
+    channels = np.zeros(len(SIGNALS) + len(further), dtype=np.uint16)
+    used = {i.signal: i.topic for i in SIGNALS if i.required or i.signal in signals}
+    for number, topic in [*used.items(), *enumerate(further, start=len(SIGNALS))]:
+        channels[number] = len(book.ids) + 1
+        book.add(f'{prefix.rstrip("/")}/{topic}', FLOAT64)
     records = _Records(channels)
     parts = _parts(blocks, records)
     first = next(parts)

@@ -205,6 +205,26 @@ class TableReader:
         return f'{told}, {self._clock.words}'
 
     @property
+    def numeric_ignored(self) -> list[str]:
+        """Return the ignored columns that hold numbers and more than one of them."""
+        heading = self._file.heading
+        cells: dict[str, list[str]] = {name: [] for name in self.ignored}
+        if self.long is not None:
+            for tag, cell in self._file.samples(self.long.tag, self.long.value):
+                if tag in cells:
+                    cells[tag].append(cell)
+        else:
+            cells = {name: self._cells(heading.names.index(name)) for name in cells}
+        return [name for name, texts in cells.items() if self._vary(texts)]
+
+    def _vary(self, texts: list[str]) -> bool:
+        import pandas as pd
+
+        values = to_numbers(pd.Series(texts, dtype=object), self._marks).values
+        numbers = values[np.isfinite(values)]
+        return 2 * len(numbers) > len(texts) and len(np.unique(numbers)) > 1
+
+    @property
     def local_guess(self) -> bool:
         """Return True if the times have no zone, so that UTC was assumed."""
         return self._clock.told_zone.startswith('UTC (')
