@@ -38,6 +38,7 @@ MINUTES = {
     'hold_limit': 150.0, 'lateness': 60.0, 'block': 60.0, 'alarm_block': 120.0,
     'refit_period': 86400.0, 'diagnosis_hour': -1, 'diagnosis_on_mismatch': False,
     'reference_after': 0.0, 'use_sim_time': True, 'state_period': 1.0,
+    'diagnostics_period': 0.2,
 }  # fmt: skip
 
 
@@ -66,11 +67,11 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
     player.play(itertools.islice(played, ROWS // 2))
     taken = 'Samples taken in all runs'
     listener.until(lambda: int(listener.value('fit', taken) or 0) > ROWS // 2 - 5, 'half of it')
-    # Health is published every second: a state as young as that has all of these samples.
+    # Health is published five times a second: a state as young as that has all of these samples.
     begun_s, age = time.monotonic(), 'Seconds since it was saved'
     listener.until(
-        lambda: time.monotonic() > begun_s + 4.0
-        and float(listener.value('state', age) or 9) < 3.0,
+        lambda: time.monotonic() > begun_s + 3.0
+        and float(listener.value('state', age) or 9) < 2.0,
         'a saved state',
     )  # fmt: skip
     monitor.kill()

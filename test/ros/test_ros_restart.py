@@ -27,7 +27,9 @@ from valveflow_ros.ros.simulator_main import effects_of, stamped_steps
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-LOG = simulate(0.3, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.2'])).table
+LOG = simulate(0.15, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.1'])).table
+# Rows at the fault, and when its alarm has been raised for a while.
+FAULT, RAISED = 8640, 10_400
 
 
 class Plant(Listener):
@@ -53,6 +55,15 @@ class Plant(Listener):
         assert not self._player.wait_for_listeners(240.0)
         self._player.play(stamped_steps([LOG.part(start, end)], False, 'unit'))
 
+    def play_to_the_alarm(self) -> None:
+        """Give the monitor time for a curve, and then a fault."""
+        self.play(0, FAULT)
+        self.until(lambda: self.curves and self.curves[-1].model_id, 'the curve')
+        self.play(FAULT, RAISED)
+        self.until(
+            lambda: self.alarms and self.alarms[-1].state == Alarm.UNACKNOWLEDGED, 'the alarm'
+        )
+
     def quiet(self, seconds: float) -> None:
         """Listen for a while."""
         until_s = time.monotonic() + seconds
@@ -75,12 +86,7 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     processes: Processes, plant: Plant, tmp_path: Path
 ) -> None:
     first = start_monitor(processes, tmp_path)
-    plant.play(0, 21000)
-    plant.until(
-        lambda: plant.curves and plant.curves[-1].model_id
-        and plant.alarms and plant.alarms[-1].state == Alarm.UNACKNOWLEDGED,
-        'curve and alarm',
-    )  # fmt: skip
+    plant.play_to_the_alarm()
     # What is still being computed or on its way is heard too.
     plant.quiet(4.0)
     raised, curve = plant.alarms[-1], plant.curves[-1]
@@ -110,7 +116,7 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     assert answer.success, answer.message
     plant.until(lambda: plant.alarms[-1].state == Alarm.ACKNOWLEDGED, 'the acknowledgement')
     assert plant.alarms[-1].occurrence == raised.occurrence
-    plant.play(21000, len(LOG))
+    plant.play(RAISED, len(LOG))
     time.sleep(1.0)
     second.send_signal(signal.SIGTERM)
     assert second.wait(10.0) == 0, processes.output(second)
@@ -135,10 +141,7 @@ def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
     if kept_by == 'state':
         given |= {'record': False, 'state_directory': str(tmp_path / 'state')}
     first = start_monitor(processes, tmp_path, **given)
-    plant.play(0, 21000)
-    plant.until(
-        lambda: plant.alarms and plant.alarms[-1].state == Alarm.UNACKNOWLEDGED, 'the alarm'
-    )
+    plant.play_to_the_alarm()
     plant.quiet(3.0)
 
     def operate(name: str, action: str) -> OperateAlarm.Response:
@@ -185,7 +188,7 @@ def test_what_a_service_confirmed_survives_a_kill_that_follows_at_once(
     assert answer.success
     assert answer.message.startswith('The alarm residual is shelved for 8 h; then it comes back')
     plant.until(lambda: plant.listeners() - known, 'the new listener')
-    plant.play(21000, 21100)
+    plant.play(RAISED, RAISED + 100)
     plant.quiet(1.0)
     second.send_signal(signal.SIGTERM)
     assert second.wait(10.0) == 0, processes.output(second)

@@ -273,23 +273,33 @@ def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None
         )
 
 
+def _longest_run(time_ns: IntArray, gap_ns: int) -> int:
+    """Return the largest number of rows in sequence without a time difference above a limit."""
+    ends = np.flatnonzero(np.diff(time_ns) > gap_ns) + 1
+    return int(np.diff([0, *ends.tolist(), len(time_ns)]).max())
+
+
 def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
     needed = [info.signal for info in _NEEDED]
-    usable = int(np.isfinite(table.values[:, needed]).all(axis=1).sum())
-    span = duration(usable * settings.real('sample_period'))
+    good = np.isfinite(table.values[:, needed]).all(axis=1)
+    usable, step_s = int(good.sum()), settings.real('sample_period')
+    span = duration(usable * step_s)
     if not learnt:
         first = duration(WARM_UP * WINDOW * settings.real('block'))
-        if (step_s := settings.real('sample_period')) >= COARSE_STEP_S:
+        at_once = _longest_run(table.time_ns[good], round(1.5 * step_s * NS_PER_S))
+        if step_s >= COARSE_STEP_S:
             rows = math.ceil(WARM_UP * WINDOW * settings.real('block') / step_s)
             return (
-                f'The log holds {counted(usable, "usable row")}, one every {duration(step_s)}; it '
-                f'takes {rows} rows ({first}) without gaps to learn the noise of the signals, and '
-                'special segments after that to find the curve. Fewer rows, 12 at least, are '
-                'enough for a static test: steady rows at one pressure and several openings.'
+                f'The log holds {counted(usable, "usable row")}, one every {duration(step_s)}, at '
+                f'most {at_once} of them without a gap; it takes {rows} rows ({first}) without '
+                'gaps to learn the noise of the signals, and special segments after that to find '
+                'the curve. Fewer rows, 12 at least, are enough for a static test: steady rows at '
+                'one pressure and several openings.'
             )
         return (
-            f'The log holds {span} of usable data; it takes {first} without gaps to learn the '
-            'noise of the signals, and special segments after that to find the curve.'
+            f'The log holds {span} of usable data, at most {duration(at_once * step_s)} of it '
+            f'without a gap; it takes {first} without gaps to learn the noise of the signals, and '
+            'special segments after that to find the curve.'
         )
     least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
     return (
