@@ -93,6 +93,8 @@ def test_every_variable_has_an_axis_and_a_hint(name):
     assert titles['text'] != name
     assert len(plain_text(titles.get('short', titles['text']))) < 36
     assert points_to(name)
+    # Of a curve over the opening, u is the opening.
+    assert not re.search(r'\bu\b', plain_text(axis_titles(name, 0.0)['text']))
 
 
 def test_a_held_cause_is_told_without_a_number_of_days():

@@ -69,8 +69,8 @@ and open result/report.html.
 
 A log is an .mcap file, a rosbag2 folder, or a table: .csv, .xlsx or .parquet.
 "valveflow VERB --help" tells more about a verb, "valveflow --version" which version this is.
-Exit status: 0 done, also if the answer is bad news; 1 not possible with these data or files; 2 wrong
-use of the command; 130 after Ctrl-C.
+Exit status: 0 done, also if the answer is bad news; 1 not possible with these data or files;
+2 wrong use of the command; 130 after Ctrl-C.
 """
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -132,7 +133,7 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
 
 def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     rows = [
-        [text(_variable(s.variable).removeprefix('the ')),
+        [text(_variable(s.variable, data.exponent).removeprefix('the ')),
          *(percent(share) for share in (s.share_before, s.share_after, s.share_chance))]
         for s in ranked
     ]  # fmt: skip
@@ -266,9 +267,16 @@ _VARIABLES = {
 _MOST_SPANS = 20
 
 
-def _variable(name: str) -> str:
-    """Return the name of a variable in a sentence."""
-    return _VARIABLES[name][0] if name in _VARIABLES else name
+def _variable(name: str, exponent: float) -> str:
+    """Return the name of a variable in a sentence; the exponent is that of u."""
+    return _of_opening(_VARIABLES[name][0], exponent) if name in _VARIABLES else name
+
+
+def _of_opening(words: str, exponent: float) -> str:
+    """Return words on u for a curve whose u is the opening: then its exponent is 0."""
+    if exponent:
+        return words
+    return re.sub(r'\bu\b', 'opening', words.replace('integrated input u', 'valve opening'))
 
 
 def axis_titles(name: str, exponent: float) -> dict[str, str]:
@@ -276,7 +284,7 @@ def axis_titles(name: str, exponent: float) -> dict[str, str]:
     if name not in _VARIABLES:
         return {'text': name}
     _, long, short, _ = _VARIABLES[name]
-    long = long.replace('{unit}', input_unit(exponent))
+    long = _of_opening(long, exponent).replace('{unit}', input_unit(exponent))
     return {'text': long, 'short': short} if short else {'text': long}
 
 
@@ -353,11 +361,12 @@ def signature_figure(s: Signature, data: Diagnosed, how: str = '') -> Figure:
     ]
     ends = [plain(float(v), 2) for v in (s.before.min(), s.before.max(), s.after.min(),
                                          s.after.max())]  # fmt: skip
+    variable = _variable(s.variable, data.exponent)
     return Figure(
         f'residual-{s.variable.replace(" ", "-")}',
-        f'<b>Measured minus simulated power against {text(_variable(s.variable))}.</b> '
+        f'<b>Measured minus simulated power against {text(variable)}.</b> '
         f'{points_to(s.variable)} {how}',
-        f'Mean residual against {_variable(s.variable)}, from {ends[0]} to {ends[1]} MW before '
+        f'Mean residual against {variable}, from {ends[0]} to {ends[1]} MW before '
         f'and {ends[2]} to {ends[3]} MW after.',
         traces, {'xaxis': across, 'yaxis': axis('mean residual (MW)')}, height=300,
     )  # fmt: skip
@@ -442,9 +451,10 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
         'margin': {'l': 56, 'r': 12, 't': 34, 'b': 70},
         'yaxis2': {'anchor': 'x2', 'matches': 'y', 'showticklabels': False},
     }  # fmt: skip
+    names = [_variable(name, data.exponent) for name in (m.across, m.up)]
     return Figure(
         f'map-{m.across.replace(" ", "-")}',
-        f'<b>Residual over {text(_variable(m.across))} and {text(_variable(m.up))}</b>, '
+        f'<b>Residual over {text(names[0])} and {text(names[1])}</b>, '
         'simulation left, extended model right. Only cells outside the 99 % band of random noise '
         'are filled: '
         f'{m.shown_before} of {m.cells} for the simulation, {m.shown_after} for the extended '
