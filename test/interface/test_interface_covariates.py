@@ -146,6 +146,13 @@ def test_a_curve_and_a_monitor_without_the_weather(plant, diagnosed, tmp_path):
         vf.identify(without, model=model)
 
 
+def test_a_parameter_file_of_the_node_names_them_too(plant):
+    given = {'covariates': 'vacuum=/nowhere'}
+    for verb in (vf.diagnose, vf.monitor):
+        with pytest.raises(InputError, match=r"covariate vacuum: .* has no column or topic '/now"):
+            verb(plant.to_dataframe(), parameters=given)
+
+
 @needs_jit
 def test_without_the_column_a_drift_is_told(plant, without):
     slow = without.disturbance

@@ -34,7 +34,7 @@ from valveflow_ros.interface.observation import (
     observe_log,
     settings_of,
 )
-from valveflow_ros.parameters import Settings
+from valveflow_ros.parameters import Settings, covariate_columns
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
 from valveflow_ros.report.page import Page
@@ -175,7 +175,8 @@ def diagnose(
     covariates : mapping of str to str, optional
         Further columns (of a recording: topics) that may influence the power, given as
         ``COLUMN`` or ``COLUMN:unit`` by name: ``{'vacuum':
-        'condenser_pressure_kpa'}``. Each is tested like a cause of the catalogue.
+        'condenser_pressure_kpa'}``. Each is tested like a cause of the catalogue. By default the
+        topics in the parameter ``covariates``.
     progress : Progress
 
     Raises
@@ -186,6 +187,9 @@ def diagnose(
         A file cannot be read, or a parameter is wrong.
     """
     given = dict(parameters or {})
+    if covariates is None:
+        covariates = covariate_columns(str(given.get('covariates', '')).split())
+    check_covariates(covariates)
     if model is not None:
         name = 'The model' if isinstance(model, Characteristic | ExtendedModel) else model
         if not isinstance(model, Characteristic | ExtendedModel):
@@ -194,7 +198,6 @@ def diagnose(
     log = as_log(log, progress)
     if model is not None:
         check_output(model, log.output_unit, 'The model')
-    check_covariates(covariates or {})
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
     rows = _rows(log, settings, model is None, progress, earlier)
@@ -208,7 +211,7 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
-    beside = covariate_rows(log, covariates or {}, rows.table)
+    beside = covariate_rows(log, covariates, rows.table)
     record = search.Record(
         rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
         covariates=beside,

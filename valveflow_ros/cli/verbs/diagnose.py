@@ -71,7 +71,9 @@ def run(options: Namespace, console: Console) -> VerbResult:
         model = load_diagnosable(options.model)
         given = with_exponent(model, given, options.model)
     log = log_of(options, mapping, console)
-    found = diagnose(log, parameters=given, model=model, covariates=covariates, progress=console)
+    found = diagnose(
+        log, parameters=given, model=model, covariates=covariates or None, progress=console
+    )
     console(0.95, 'writing the report')
     return write_results(found, options, _text(found), to_json(found.diagnosis))
 
