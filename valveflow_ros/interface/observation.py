@@ -287,19 +287,21 @@ def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
     if not learnt:
         first = duration(WARM_UP * WINDOW * settings.real('block'))
         at_once = _longest_run(table.time_ns[good], round(1.5 * step_s * NS_PER_S))
+        whole = at_once == usable
         if step_s >= COARSE_STEP_S:
             rows = math.ceil(WARM_UP * WINDOW * settings.real('block') / step_s)
+            longest = '' if whole else f', at most {at_once} of them without a gap'
             return (
-                f'The log holds {counted(usable, "usable row")}, one every {duration(step_s)}, at '
-                f'most {at_once} of them without a gap; it takes {rows} rows ({first}) without '
-                'gaps to learn the noise of the signals, and special segments after that to find '
-                'the curve. Fewer rows, 12 at least, are enough for a static test: steady rows at '
-                'one pressure and several openings.'
+                f'The log holds {counted(usable, "usable row")}, one every {duration(step_s)}'
+                f'{longest}; it takes {rows} rows ({first}) without gaps to learn the noise of '
+                'the signals, and special segments after that to find the curve. Fewer rows, 12 '
+                'at least, are enough for a static test: steady rows at one pressure and several '
+                'openings.'
             )
+        longest = '' if whole else f', at most {duration(at_once * step_s)} of it without a gap'
         return (
-            f'The log holds {span} of usable data, at most {duration(at_once * step_s)} of it '
-            f'without a gap; it takes {first} without gaps to learn the noise of the signals, and '
-            'special segments after that to find the curve.'
+            f'The log holds {span} of usable data{longest}; it takes {first} without gaps to '
+            'learn the noise of the signals, and special segments after that to find the curve.'
         )
     least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
     return (
