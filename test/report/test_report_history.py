@@ -63,7 +63,9 @@ def bars_of(told):
 
 def largest_move(told):
     """Return the input and the MW that the words give."""
-    said = re.search(r'the earlier ones at u = ([\d.]+), by ([−\d.]+) MW', words_of(told))
+    said = re.search(
+        r'the earlier ones at [−\d.]+ MW \(u = ([\d.]+)\), by ([−\d.]+) MW', words_of(told)
+    )
     return float(said[1]), float(said[2].replace('−', '-'))
 
 

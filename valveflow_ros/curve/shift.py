@@ -83,7 +83,7 @@ def _judgement(shift: Shift, curve: Characteristic) -> str:
         f'At {curve.place_words(worst.u_from, worst.u_to)} (piece {number}) the unit gives '
         f'{short(abs(worst.shift_mw), 1)} MW ({abs(worst.percent):.1f} %) {side} than '
         f'{reference}, {_since_words(shift)}. Confidence: {_confidence(worst)}.'
-        f'{_others(shift, others)}'
+        f'{_others(shift, others, curve)}'
     )
 
 
@@ -112,13 +112,15 @@ def _confidence(piece: PieceShift) -> str:
     return f'{100.0 * piece.confidence:.2f} %'
 
 
-def _others(shift: Shift, numbers: list[int]) -> str:
+def _others(shift: Shift, numbers: list[int], curve: Characteristic) -> str:
     if not numbers:
         return ''
-    told = ', '.join(
-        f'piece {k} by {short(shift.pieces[k - 1].shift_mw, 1, "+")} MW' for k in numbers
-    )
-    return f' {told[0].upper()}{told[1:]} too.'
+    told = []
+    for k in numbers:
+        p = shift.pieces[k - 1]
+        place = curve.place_words(p.u_from, p.u_to)
+        told.append(f'at {place} (piece {k}) by {short(p.shift_mw, 1, "+")} MW')
+    return f' It has changed {", ".join(told)} too.'
 
 
 # The errors of curves assume uniform samples over a piece and noise with a short correlation
@@ -336,8 +338,9 @@ def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) 
     side = 'more' if size > 0.0 else 'less'
     return (
         f'The unit changed within these data: since about {minute(since_ns)} it gives '
-        f'{short(abs(size), 1)} MW {side} at the same opening and pressure, so this curve is a '
-        'mixture of before and after. "valveflow diagnose" looks for the cause; "valveflow '
+        f'{short(abs(size), 1)} MW {side} at the same opening and pressure (mean over the loads '
+        'seen), so this curve is a mixture of before and after. "valveflow diagnose" looks for '
+        'the cause; "valveflow '
         f'identify --from {minute(since_ns).removesuffix(" UTC").replace(" ", "T")}Z" gives the '
         'curve since then.'
     )

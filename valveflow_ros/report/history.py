@@ -499,9 +499,14 @@ def _curves(history: History) -> list[str | Figure]:
         return [paragraph(words)]
     at, moved = largest_move(history)
     if np.isfinite(moved):
+        last = found[-1]
+        place = f'{decimals(float(np.interp(at, last.u, last.power_mw)), 0)} MW'
+        place += (
+            f' (u = {decimals(at, 0)})' if last.exponent else f' ({decimals(at, 1)} % opening)'
+        )
         words += (
             f' The last curve differs most from the median of the earlier ones at '
-            f'u = {decimals(at, 0)}, by {decimals(moved, 2)} MW.'
+            f'{place}, by {decimals(moved, 2)} MW.'
         )
     return [paragraph(words), curve_history_figure(history)]
 

@@ -120,21 +120,24 @@ def verdict_words(data: Validated) -> list[str]:
             f'{percent(v.outside_share, 2)} of the special samples lie beyond the ends of the '
             'curve, where nothing is known; they were not judged.'
         )
-    if blind := [span(c.u_from, c.u_to) for c in v.pieces if not c.segments]:
-        told.append(f'No special segment lies at u from {", ".join(blind)}: nothing is said of '
-                    'that.')  # fmt: skip
+    place = v.characteristic.place_words
+    if blind := [place(c.u_from, c.u_to) for c in v.pieces if not c.segments]:
+        told.append(f'No special segment lies at {", ".join(blind)}: nothing is said of that.')
     return [*told, *weaknesses(v.characteristic)]
 
 
 def _verdict(v: Validation) -> str:
     def differs(check: PieceCheck) -> str:
+        whole = check is v.overall
+        where = '' if whole else f'at {place(check.u_from, check.u_to)} '
         return (
-            f'the measured power differs by {signed(check.test.mean, 2)} MW from what it predicts '
+            f'{where}the measured power differs by {signed(check.test.mean, 2)} MW'
+            f'{" (mean over the loads seen)" if whole else ""} from what it predicts '
             f'({interval(check.low_mw, check.high_mw)} MW with 95 % confidence)'
         )
 
-    tolerance = f'{v.tolerance_mw:.3g} MW'
-    mean = f'over all segments {differs(v.overall)}'
+    tolerance, place = f'{v.tolerance_mw:.3g} MW', v.characteristic.place_words
+    mean = differs(v.overall)
     if v.verdict is Verdict.HOLDS:
         return (
             f'The characteristic is valid: {mean}, and within {tolerance} on each piece, with '
@@ -143,17 +146,16 @@ def _verdict(v: Validation) -> str:
     if v.misfit_beyond:
         return (
             f'The characteristic is off by {misfit_words(v.misfit_beyond)}; the tolerance '
-            f'is {tolerance}. On average, {mean}.'
+            f'is {tolerance}. {mean[0].upper()}{mean[1:]}.'
         )
     if v.verdict is Verdict.OFF:
         off = [c for c in (v.overall, *v.pieces) if c.beyond(v.tolerance_mw)]
         worst = max(off, key=lambda c: abs(c.test.mean))
         return (
-            f'The characteristic is off: at u from {span(worst.u_from, worst.u_to)} '
-            f'{differs(worst)}, more than the tolerance of {tolerance}.'
+            f'The characteristic is off: {differs(worst)}, more than the tolerance of {tolerance}.'
         )
     real = '; the difference is real' if v.overall.test.zero_is_rejected() else ''
-    which = 'For the mean over all segments'
+    which = 'For the mean over the loads seen'
     # The pieces without a clear result.
     if unsettled := [
         str(k) for k, c in enumerate(v.pieces, 1) if c.segments and not c.within(v.tolerance_mw)
