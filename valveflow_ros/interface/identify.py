@@ -14,6 +14,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.curve.compensation import openings_seen
 from valveflow_ros.curve.shift import ShiftLimits, judge_shift, mixture_sentence, shift_json
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
@@ -79,7 +80,11 @@ class Identification(Result):
     def characteristic(self) -> Characteristic:
         """Return the curve; its notes begin with the reasons not to rely on it."""
         c, doubts = self.data.characteristic, (self.data.mixture, doubt(self.data))
-        return replace(c, notes=(*filter(None, doubts), *c.notes))
+        notes = (*filter(None, doubts), *c.notes)
+        opening, pressure = (
+            self.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
+        )
+        return replace(c, notes=notes, openings_seen=openings_seen(opening, pressure))
 
     @property
     def table(self) -> SampleTable:
