@@ -53,8 +53,9 @@ from valveflow_ros.signals.units import in_unit
 
 CURVE = 'characteristic.json'
 STEP_TEST_ADVICE = (
-    'This looks like a manual step test (few openings, each held): --step-test identifies it '
-    'from its steady states.'
+    'This looks like a manual step test (few openings, each held). If the load controller was in '
+    'manual, --step-test identifies it from its steady states; for data of a closed loop do not '
+    'use it.'
 )
 
 
