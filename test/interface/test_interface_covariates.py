@@ -56,6 +56,9 @@ def test_the_vacuum_is_named_with_its_size(plant, diagnosed, without):
     assert found.gain.rmse_after < 0.6 * found.gain.rmse_before
     assert d.rmse_extended < 0.6 * without.rmse_extended
     assert f'for every kPa that {COLUMN} (vacuum) is higher' in found.sentence
+    (meaning,) = (note for note in d.notes if note.startswith('vacuum: '))
+    assert f'b is its effect in MW for each kPa of {COLUMN}, at the mean load of ' in meaning
+    assert 'they correct the curve by a1 (L - 1) + a2 (L - 1)^2' in meaning
 
 
 @needs_jit
