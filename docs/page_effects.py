@@ -93,8 +93,9 @@ def _picture(name: str) -> str:
     ]
     for cause in d['causes']:
         lines += ['', f'Estimated: {_estimates(cause)}.']
-    if d['not_told_apart']:
-        apart = ', '.join(f'[{n}]({n}.md)' for n in d['not_told_apart'])
+    # The sentence has said the others.
+    if near := [n for n in d['not_told_apart'] if n not in t['sentence']]:
+        apart = ', '.join(f'[{n}]({n}.md)' for n in near)
         lines += ['', f'Not told apart in this record: {apart}.']
     return '\n'.join(lines)
 

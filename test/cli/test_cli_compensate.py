@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from curves import curve
 
-from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.curve.characteristic_json import from_json, to_json
+from valveflow_ros.curve.compensation import openings_seen
 
 pq = pytest.importorskip('pyarrow.parquet')
 
@@ -189,7 +190,7 @@ def test_a_curve_that_depends_on_the_pressure_needs_one(run, tmp_path):
     assert power == pytest.approx(columns['power_mw'], abs=0.01)
 
 
-def test_knees_at_fixed_openings_are_a_table_for_one_pressure(run, tmp_path):
+def test_knees_at_fixed_openings_are_a_table_for_each_pressure(run, tmp_path):
     file = tmp_path / 'characteristic.json'
     c = curve(
         [20.0, 45.0, 70.0, 100.0], [0.4, 0.25, 0.1], start=5.0, axis='opening',
@@ -197,11 +198,15 @@ def test_knees_at_fixed_openings_are_a_table_for_one_pressure(run, tmp_path):
         reference_pressure_mpa=13.0,
     )  # fmt: skip
     file.write_text(json.dumps(to_json(c)))
-    refused = run(
-        'compensate', '--model', file, '-o', tmp_path / 'both.csv',
-        '--pressure', '10', '--pressure', '16',
-    ).refused(status=2)  # fmt: skip
-    assert 'one table for each --pressure' in refused
+    both = tmp_path / 'both.csv'
+    words = ['compensate', '--model', file, '-o', both, '--pressure', '10', '--pressure', '16']
+    assert run(*words).status == 0
+    rows = rows_of(both)
+    assert {r['pressure_mpa'] for r in rows} == {10.0, 16.0}
+    for row in rows:
+        found = c.power(np.array([row['opening_percent']]), row['pressure_mpa'])
+        assert found[0] == pytest.approx(row['power_mw'], abs=0.02)
+    assert len(run(*words, '--overwrite', '--json').json['tables']) == 2
     for pressure, given in ((13.0, []), (10.0, ['--pressure', '10'])):
         path = tmp_path / f'{pressure:g}.csv'
         assert run('compensate', '--model', file, '-o', path, *given).status == 0
@@ -209,3 +214,25 @@ def test_knees_at_fixed_openings_are_a_table_for_one_pressure(run, tmp_path):
         at = head.split(',').index(f'opening_percent_at_{pressure:g}_mpa')
         table = np.array([[float(x) if x else np.nan for x in r.split(',')] for r in rows])
         assert c.power(table[:, at], pressure) == pytest.approx(table[:, 0], abs=0.02)
+
+
+def test_openings_that_were_not_seen_at_a_pressure_are_marked(run, model, tmp_path):
+    opening, pressure = np.random.default_rng(1).uniform(
+        [[40.0], [9.0]], [[60.0], [11.0]], (2, 900)
+    )
+    opening[pressure > 10.0] += 20.0
+    seen = openings_seen(np.append(opening, np.nan), np.append(pressure, 30.0))
+    assert sum(band.samples for band in seen) >= 890
+    file, table = model(openings_seen=seen), tmp_path / 'x.csv'
+    asked = [word for p in ('9.5', '10.5', '20') for word in ('--pressure', p)]
+    ran = run('compensate', '--model', file, '-o', table, *asked)
+    assert ran.status == 0, ran.err
+    rows = rows_of(table)
+    for p, low, high in ((9.5, 40.0, 60.0), (10.5, 60.0, 80.0)):
+        for row in rows:
+            there = low < row[f'opening_percent_at_{p:g}_mpa'] < high
+            assert row[f'seen_at_{p:g}_mpa'] == there
+    assert not any(row['seen_at_20_mpa'] for row in rows)
+    assert 'At about 9.5 MPa identify saw the unit from 40.' in ran.err
+    assert 'At about 20 MPa identify saw the unit at no opening: 16 rows' in ran.err
+    assert from_json(json.loads(file.read_text())).openings_seen == seen

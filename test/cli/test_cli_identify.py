@@ -163,7 +163,7 @@ def stairs(t):
     ('log', 'options', 'part'),
     [
         (table(3, lambda t: 55.0), [], 'never changes'),
-        (table(0.15, stairs), [], 'holds 9 min of usable data; .* to learn the noise'),
+        (table(0.15, stairs), [], 'holds 9 min of usable data. To learn .* 4 stretches'),
         (table(3, stairs), ['--set', 'steady_min=1500'], 'in 3 h of data: the valve must rest'),
         (table(6, stairs, lambda t, rng: 200.0 + 5.0 * rng.standard_normal(len(t))), [],
          'hardly follows the valve'),
@@ -182,6 +182,18 @@ def test_what_carries_no_curve_is_refused_and_nothing_is_written(
     ).refused()  # fmt: skip
     assert re.search(part, sentence), sentence
     assert [p.name for p in tmp_path.iterdir()] == ['log.parquet']
+
+
+def test_many_rows_with_gaps_are_told_by_their_longest_stretch(run, tmp_path):
+    pressure = 12.0 + np.sin(np.arange(600) / 50.0)
+    log = table(10, lambda t: 55.0 + 10.0 * np.sin(t / 700.0), pressure=pressure, step_s=60)
+    log = log.take(np.flatnonzero(np.arange(600) % 60 < 30))
+    write_table(log, tmp_path / 'log.csv')
+    told = run('identify', tmp_path / 'log.csv', '-o', tmp_path / 'out').refused()
+    assert (
+        'The log holds 308 usable rows, one every 1 min, at most 31 without a gap. To learn the '
+        'noise of the signals it takes 4 stretches of 42 rows (42 min) without a gap' in told
+    )
 
 
 def test_a_log_without_a_signal_names_the_two_options(run, logs, tmp_path):

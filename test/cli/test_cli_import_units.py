@@ -142,3 +142,19 @@ def test_a_log_with_some_possible_pressures_is_read_with_a_warning(run, tmp_path
     ran = run('import', tmp_path / 'a.csv', '--dry-run')
     assert ran.status == 0
     assert 'impossible' in ran.err
+
+
+@pytest.mark.parametrize('said', [[], ['--column', 'main_steam_pressure=Pressure [kPa]']])
+def test_the_pressure_of_a_condenser_is_not_advised_as_megapascal(run, tmp_path, write_csv, said):
+    table = write_csv(
+        'time,Valve position [%],Pressure [kPa],Main steam temperature [degC],Power [MW]',
+        [f'{1700000000 + 60 * k},{50 + k % 7},{4 + 0.1 * (k % 9)},540,{200 + k % 5}'
+         for k in range(60)],
+    )  # fmt: skip
+    refused = run('import', table, '-o', tmp_path / 'x.mcap', *said).refused()
+    assert (
+        'That is the pressure of a condenser, not of main steam, unless kPa is wrong and they are '
+        'in MPa. Name the right column with --column main_steam_pressure=THEIRS[:unit]' in refused
+    )
+    assert 'look like MPa' not in refused
+    assert refused.endswith('--column main_steam_pressure=THEIRS')

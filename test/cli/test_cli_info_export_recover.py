@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 from logged import rewritten
@@ -12,7 +14,7 @@ from monitor_recording import FLOAT64, Monitor, cdr, diagnosis, recording
 from valveflow_ros.interface.logs import open_log as open_whole_log
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.settings import settings_for
-from valveflow_ros.logs import open_log, read_table
+from valveflow_ros.logs import RecordingWriter, open_log, read_table
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 from valveflow_ros.signals.align import align_whole
 
@@ -185,3 +187,21 @@ def test_a_folder_named_by_a_dot_has_its_name(logs, tmp_path, monkeypatch):
     (home / 'plant.mcap').write_bytes((logs / 'plant.mcap').read_bytes())
     monkeypatch.chdir(home)
     assert open_whole_log('.').name == 'unit7'
+
+
+def test_the_times_of_the_data_stand_before_those_of_the_recording(run, tmp_path):
+    """A day that was replayed in two minutes."""
+    start, replay = 1_700_000_000 * NS_PER_S, 1_750_000_000 * NS_PER_S
+    with RecordingWriter(tmp_path / 'replay') as writer:
+        topics = [info.topic for info in SIGNALS if info.required]
+        for topic in topics:
+            writer.add_topic(f'/{topic}', FLOAT64)
+        data = bytes((0, 1, 0, 0)) + struct.pack('<d', 12.0)
+        for k in range(121):
+            for topic in topics:
+                times = replay + k * NS_PER_S, start + k * 720 * NS_PER_S
+                writer.write(f'/{topic}', data, *times)
+    ran = run('info', tmp_path / 'replay')
+    lines = ran.out.splitlines()
+    assert lines[1] == '  data: 2023-11-14 22:13:20 UTC to 2023-11-15 22:13:20 UTC (1 d)'
+    assert lines[2].startswith('  recorded: 2025-06-15 15:06:40 UTC to 2025-06-15 15:08:40 UTC')

@@ -40,7 +40,9 @@ def test_a_step_test_gives_a_curve_others_can_read(run, levels_log, tmp_path):
 
 def test_the_way_to_a_step_test_is_told(run, levels_log, tmp_path):
     ran = run('identify', levels_log, '-o', tmp_path / 'out', '--set', 'min_fit_samples=100000')
-    assert '--step-test identifies it' in ran.refused()
+    refused = ran.refused()
+    assert '--step-test identifies it' in refused
+    assert 'for data of a closed loop do not use it' in refused
 
 
 def test_ordinary_operation_is_no_step_test(run, logs, tmp_path):

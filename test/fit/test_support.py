@@ -131,3 +131,21 @@ def test_what_pieces_rest_on_and_the_confidence_survive_json():
     plain = from_json(raw)
     assert plain.support == ()
     assert plain.choice.confidence == {}
+
+
+@pytest.mark.parametrize(
+    ('stderr', 'words'),
+    [
+        (0.002, 'its slope follows from the pieces beside it'),
+        (0.02, 'so its slope is uncertain'),
+        (np.nan, 'so its slope is uncertain'),
+    ],
+)
+def test_a_slope_with_a_small_error_is_not_told_as_uncertain(stderr, words):
+    whole = curve([1000.0, 1400.0, 1800.0], [0.2, 0.1])
+    pieces = tuple(dataclasses.replace(p, slope_stderr=stderr) for p in whole.pieces)
+    window = contents((1200.0, 1200.0, STEADY), (1500.0, 1700.0, SLOPE))
+    told = with_support(dataclasses.replace(whole, pieces=pieces), window, NOISE).notes
+    (said,) = (note for note in told if note.startswith('Piece 1 '))
+    assert 'has steady data at one load only' in said
+    assert words in said

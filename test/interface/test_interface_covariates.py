@@ -62,6 +62,9 @@ def test_the_vacuum_is_named_with_its_size(plant, diagnosed, without):
     assert found.gain.rmse_after < 0.6 * found.gain.rmse_before
     assert d.rmse_extended < 0.6 * without.rmse_extended
     assert f'for every kPa that {COLUMN} (vacuum) is higher' in found.sentence
+    (meaning,) = (note for note in d.notes if note.startswith('vacuum: '))
+    assert f'b is its effect in MW for each kPa of {COLUMN}, at the mean load of ' in meaning
+    assert 'they correct the curve by a1 (L - 1) + a2 (L - 1)^2' in meaning
 
 
 @needs_jit
@@ -162,9 +165,8 @@ def test_without_the_column_a_drift_is_told(plant, without):
     line = np.polynomial.Polynomial.fit(frame['generated_power_mw'], frame[COLUMN], 3)
     apart = frame[COLUMN] - line(frame['generated_power_mw'])
     assert slow.drift_mw == pytest.approx(abs(truth(plant)) * apart.std(), rel=0.3)
-    assert (
-        f'The power varies slowly over days, by about {slow.drift_mw:.2g} MW,' in without.sentence
-    )
+    told = f'The power varies slowly over days, by about {slow.drift_mw:.2g} MW (mean over the '
+    assert told in without.sentence
     if without.verdict == 'nothing':
         assert 'down to a slow disturbance and its noise' in without.sentence
     assert 'down to its noise' not in without.sentence

@@ -361,7 +361,10 @@ def test_where_the_residual_is_gone_it_still_says_how_far_it_was(share, words):
     _, told = lived(slow, (share, 1), 'restore', (0.0, DAY_S + 60))
     (_, first), (_, again) = told
     assert words in first.sentence
-    assert f'The unit gave {words} than its valve curve. ' in again.sentence
+    assert (
+        f'The unit gave {words} than its valve curve (mean over the loads seen). '
+        in again.sentence
+    )
 
 
 def test_a_change_carries_its_numbers():

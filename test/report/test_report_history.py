@@ -62,8 +62,10 @@ def bars_of(told):
 
 
 def largest_move(told):
-    """Return the load and the difference in MW that the words give."""
-    said = re.search(r'the earlier ones at ([\d.]+) MW, by ([−\d.]+) MW', words_of(told))
+    """Return the input and the MW that the words give."""
+    said = re.search(
+        r'the earlier ones at [−\d.]+ MW \(u = ([\d.]+)\), by ([−\d.]+) MW', words_of(told)
+    )
     return float(said[1]), float(said[2].replace('−', '-'))
 
 
@@ -124,12 +126,11 @@ def test_what_has_no_time_is_no_part_of_the_story_and_a_shift_has_its_last_words
 @given(st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3))
 def test_the_largest_move_is_that_of_the_last_curve_and_lies_at_a_knot(change):
     told = history()
-    load_mw = round(told.curves[3].power_mw[-1])
-    assert largest_move(replace(told, curves=told.curves[:4])) == (load_mw, STEP_MW)
+    assert largest_move(replace(told, curves=told.curves[:4])) == (KNOTS[-1], STEP_MW)
     # One young curve that jumped does not change what is usual.
     first, *others = told.curves[:4]
     jumped = replace(first, power_mw=first.power_mw + 50.0)
-    assert largest_move(replace(told, curves=(jumped, *others))) == (load_mw, STEP_MW)
+    assert largest_move(replace(told, curves=(jumped, *others))) == (KNOTS[-1], STEP_MW)
     base = told.curves[-1]
     other = replace(base, power_mw=base.power_mw + np.array(change))
     _, moved = largest_move(replace(told, curves=(base, other)))

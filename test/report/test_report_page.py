@@ -239,7 +239,7 @@ def test_confidence_and_support_stand_in_the_page(make):
     for part in ('93.0 %', '7.0 %', '3 steady states at 2 levels, 2 slope responses',
                  '1 steady state at 1 level'):  # fmt: skip
         assert part in page
-    assert page.count('not identifiable by itself') == 1
+    assert page.count('slope uncertain') + page.count('follows from the pieces beside it') == 1
     assert 'more than 99.9 %' in confidence_table(replace(choice, confidence={2: 1.0}))
 
 

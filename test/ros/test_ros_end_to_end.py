@@ -102,7 +102,9 @@ def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None
 
     listener.until(raised, 'the alarm of the fault')
     alarm = listener.alarms[-1]
-    assert 'MW less than its valve curve, since about ' in alarm.sentence
+    assert (
+        'MW less than its valve curve (mean over the loads seen), since about ' in alarm.sentence
+    )
     assert (alarm.name, alarm.unit, alarm.header.frame_id) == ('residual', '', 'unit 1')
     assert abs(alarm.value) > alarm.limit == 1.0
     assert alarm.value < -alarm.limit < 0.0

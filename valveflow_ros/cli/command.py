@@ -292,7 +292,10 @@ def add_analysis(parser: ArgumentParser, log: str = 'the log to read') -> None:
 def add_analysis_options(parser: ArgumentParser) -> None:
     """Add the options of every analysis: parameters, additional files, how to read the log."""
     parser.add_argument(
-        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
+        '--params',
+        metavar='FILE',
+        type=Path,
+        help='parameters: a YAML file as the node takes it, or with one NAME: VALUE in a line',
     )
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',

@@ -67,10 +67,10 @@ Try it:
   valveflow identify plant.mcap -o result
 and open result/report.html.
 
-A log is an .mcap file, a rosbag2 folder, or a table: .csv, .xlsx or .parquet.
+A log is an .mcap file (a recording of ROS 2), a rosbag2 folder, or a table: .csv, .xlsx or
+.parquet. Exit status: 0 done; 1 not possible, and a sentence says why; 2 wrong use of the command;
+130 ended by Ctrl-C.
 "valveflow VERB --help" tells more about a verb, "valveflow --version" which version this is.
-Exit status: 0 done, also if the answer is bad news; 1 not possible with these data or files;
-2 wrong use of the command; 130 after Ctrl-C.
 """
 
 

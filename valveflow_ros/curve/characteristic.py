@@ -227,6 +227,17 @@ def level_error_mw(wander_mw: float, start_ns: int, end_ns: int) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class OpeningsSeen:
+    """The openings at which the unit ran in a band of the pressure; 99 % of its rows."""
+
+    pressure_from_mpa: float
+    pressure_to_mpa: float
+    opening_from_percent: float
+    opening_to_percent: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
 class Characteristic:
     """A fitted flow characteristic: static power is p^e F(u) + c.
 
@@ -244,6 +255,8 @@ class Characteristic:
         Median pressure of the data, NaN if unknown; see `shown_at_mpa`.
     form : FormEvidence or None
         Comparison of this form with the other one; None if they were not compared.
+    openings_seen : tuple of OpeningsSeen
+        By rising pressure, without bands in which the unit did not run; empty if unknown.
     output_unit : str
         MW, or the unit of a flow: all values named ``_mw`` or described as MW have this unit.
     """
@@ -266,6 +279,7 @@ class Characteristic:
     reference_pressure_mpa: float = field(default=math.nan, repr=False)
     form: FormEvidence | None = field(default=None, repr=False)
     output_unit: str = field(default='MW', repr=False)
+    openings_seen: tuple[OpeningsSeen, ...] = field(default=(), repr=False)
 
     @property
     def static_form(self) -> StaticForm:

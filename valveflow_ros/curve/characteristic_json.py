@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import enum
 import math
+from dataclasses import asdict
 from typing import Any
 
 from valveflow_ros.curve.characteristic import (
@@ -15,6 +16,7 @@ from valveflow_ros.curve.characteristic import (
     FittedData,
     FormEvidence,
     HeldCause,
+    OpeningsSeen,
     Piece,
     RegionDynamics,
     ResidualStatistics,
@@ -165,6 +167,7 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         'offset_mw': c.offset_mw,
         'reference_pressure_mpa': _number(c.reference_pressure_mpa),
         **_form_json(c.form),
+        **({'openings_seen': [asdict(s) for s in c.openings_seen]} if c.openings_seen else {}),
         'pieces': _supported_json(c),
         'breakpoint_intervals': [[_number(lo), _number(hi)] for lo, hi in c.breakpoint_intervals],
         'selection': {
@@ -242,6 +245,11 @@ _FORM = {
     'worst': Maybe({name: Number(-1e12, 1e12, null=True) for name in _WORST}),
     'contradicted': Maybe(Flag()),
 }  # fmt: skip
+_OPENING, _MPA = Number(-1e3, 1e3), Number(-100.0, 100.0)
+_SEEN = {
+    'pressure_from_mpa': _MPA, 'pressure_to_mpa': _MPA, 'opening_from_percent': _OPENING,
+    'opening_to_percent': _OPENING, 'samples': Count(),
+}  # fmt: skip
 _SCHEMA = {
     'model_id': Maybe(Text()),
     'output_unit': OUTPUT_UNIT,
@@ -251,6 +259,7 @@ _SCHEMA = {
     'offset_mw': Maybe(Number(*MW)),
     'reference_pressure_mpa': Maybe(Number(1e-6, 100.0, null=True)),
     'form': Maybe(_FORM),
+    'openings_seen': Maybe(ListOf(_SEEN, most=1000)),
     'pieces': ListOf(
         {**PIECE, 'identifiable': Maybe(Flag()), 'support': Maybe(_SUPPORT)}, 1, MOST_PIECES
     ),
@@ -354,6 +363,7 @@ def from_json(raw: object) -> Characteristic:
         reference_pressure_mpa=math.nan if pressure is None else pressure,
         form=_form(top['form']),
         output_unit=top['output_unit'] or 'MW',
+        openings_seen=tuple(OpeningsSeen(**seen) for seen in top['openings_seen'] or ()),
     )  # fmt: skip
 
 

@@ -10,7 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic import Characteristic, Piece, curve_error, piece_of
+from valveflow_ros.curve.characteristic import (
+    Characteristic,
+    OpeningsSeen,
+    Piece,
+    curve_error,
+    piece_of,
+)
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.records import FloatArray
 
@@ -84,6 +90,9 @@ def _error(x: FloatArray, y: FloatArray, a: int, b: int) -> float:
     return float(np.max(np.abs(line - x[a + 1 : b])))
 
 
+# Width of a band of the pressure, relative to the median; share of the rows left out on each
+# side of the openings of a band; fewer rows are no operation.
+_BAND, _OUTSIDE, _LEAST_ROWS = 0.05, 0.005, 10
 _JOINED_MW = 1e-6  # smaller differences of two pieces' ends are rounding, not jumps
 _CHECKED = 20_001  # number of powers at which the inverse is tested
 _STEEP = 5.0  # default gain limit, as a multiple of the smallest gain
@@ -362,3 +371,49 @@ def _notes(made: Compensation, points: int, exact: int) -> tuple[str, ...]:
             f'up to {made.table_mw:.3g} MW.'
         )
     return tuple(notes)
+
+
+def openings_seen(opening: FloatArray, pressure: FloatArray) -> tuple[OpeningsSeen, ...]:
+    """Return the openings at which a unit ran, by bands of the pressure.
+
+    Parameters
+    ----------
+    opening, pressure : float64 (n,)
+        %, MPa; rows with NaN are ignored.
+    """
+    known = np.isfinite(opening) & np.isfinite(pressure)
+    v, p = opening[known], pressure[known]
+    if len(p) < _LEAST_ROWS:
+        return ()
+    low, high = np.quantile(p, (_OUTSIDE, 1.0 - _OUTSIDE)).tolist()
+    count = max(1, math.ceil((high - low) / max(_BAND * abs(float(np.median(p))), 1e-9)))
+    edges = np.linspace(low, high, count + 1)
+    band = np.searchsorted(edges[1:-1], p, side='right')
+    band[(p < low) | (p > high)] = -1
+    found = []
+    for k in range(count):
+        here = v[band == k]
+        if len(here) >= _LEAST_ROWS:
+            least, most = np.quantile(here, (_OUTSIDE, 1.0 - _OUTSIDE)).tolist()
+            ends = float(edges[k]), float(edges[k + 1])
+            found.append(OpeningsSeen(*ends, least, most, len(here)))
+    return tuple(found)
+
+
+def seen_at(curve: Characteristic, pressure_mpa: float) -> tuple[float, float] | None:
+    """Return the range of openings seen at a pressure; None if the unit did not run at it.
+
+    The pressure may lie outside the bands of the curve by half the width of one.
+    """
+
+    def away(band: OpeningsSeen) -> float:
+        low, high = band.pressure_from_mpa, band.pressure_to_mpa
+        return max(low - pressure_mpa, pressure_mpa - high, 0.0)
+
+    nearest = min(curve.openings_seen, key=away, default=None)
+    if nearest is None:
+        return None
+    most = 0.5 * max(_BAND * pressure_mpa, nearest.pressure_to_mpa - nearest.pressure_from_mpa)
+    if away(nearest) > most:
+        return None
+    return nearest.opening_from_percent, nearest.opening_to_percent

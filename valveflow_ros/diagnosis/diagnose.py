@@ -668,9 +668,26 @@ def _conclude(
         simulation=simulation, extended=extended,
         final=final.without_causes() if dropped else final,
         reference=grids.reference, mean_s=grids.mean_s,
-        notes=tuple(note for note in (*notes(grids), rest.own_misfit, alike) if note),
+        notes=tuple(
+            note for note in (*notes(grids), *_of_covariates(models[-1]), rest.own_misfit, alike)
+            if note
+        ),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))
+
+
+def _of_covariates(model: Extended) -> list[str]:
+    """Return the meaning of the parameters of each covariate that was named."""
+    told = []
+    for about in (a.cause.covariate for a in model.active):
+        if about is not None:
+            told.append(
+                f'{about.name}: b is its effect in MW for each {about.unit or "unit"} of '
+                f'{about.column}, at the mean load of {about.power_mw:.0f} MW. a1 and a2 (MW) are '
+                'no effect of it: with L = load / mean load they correct the curve by a1 (L - 1) '
+                '+ a2 (L - 1)^2, because column and load may have changed together by chance.'
+            )
+    return told
 
 
 def _other_bend(task: Task, final: Extended, found: SearchResult) -> dict[str, Estimate]:

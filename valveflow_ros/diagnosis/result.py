@@ -91,16 +91,19 @@ class Disturbance:
         """Return it as a sentence for an operator."""
         hours = self.time_scale_s / 3600.0
         if self.shape:
-            return f'The power changes in time: {self.shape}. Which cause makes it is not known.'
+            return (
+                f'The power changes in time (mean over the loads seen): {self.shape}. Which cause '
+                'makes it is not known.'
+            )
         if self.drift_mw is not None:
             length = 'days' if hours >= _DAYS_FROM_H else 'hours'
             return (
-                f'The power varies slowly over {length}, by about {self.drift_mw:.2g} MW, for a '
-                'reason that these signals do not show.'
+                f'The power varies slowly over {length}, by about {self.drift_mw:.2g} MW (mean '
+                'over the loads seen), for a reason that these signals do not show.'
             )
         return (
-            f'The power varies slowly, by about {self.rms_mw:.2g} MW over {hours:.2g} h, for a '
-            'reason that these signals do not show.'
+            f'The power varies slowly, by about {self.rms_mw:.2g} MW (mean over the loads seen) '
+            f'over {hours:.2g} h, for a reason that these signals do not show.'
         )
 
 

@@ -203,6 +203,7 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
 # or from the rows between segments, and a note reports this.
 
 NOT_REFINED = 'The curve is not refined: '  # beginning of a note on that
+_SMALL = 0.05  # half of a small 95 % interval, relative to the slope
 _LEAST_ROWS = 30  # minimum rows of a segment inside a piece to be counted
 _APART = 10.0  # minimum difference of two distinct levels, in noise sd of u
 
@@ -320,10 +321,24 @@ def _sentence(c: Characteristic, number: int, piece: Piece, found: Support) -> s
         rests = 'has steady data at one load only'
     places = _missing(piece, np.array(found.levels))
     loads = ' and one at '.join(_operation(c, piece, u) for u in places)
+    if is_borrowed(piece):
+        return (
+            f'{name} {rests}: its slope follows from the pieces beside it, and its error holds if '
+            f'the piece is straight. One hour of constant operation at about {loads} would check '
+            'it.'
+        )
     return (
         f'{name} {rests}, so its slope is uncertain. One hour of constant operation at about '
         f'{loads} would give it.'
     )
+
+
+def is_borrowed(piece: Piece) -> bool:
+    """Return True if the error of a slope is small although the piece has too few data.
+
+    The pieces meet, so that the data of its neighbours determine a piece too.
+    """
+    return 0.0 < _Z95 * piece.slope_stderr < _SMALL * abs(piece.slope)
 
 
 def _operation(c: Characteristic, piece: Piece, u: float) -> str:

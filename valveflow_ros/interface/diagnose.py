@@ -49,8 +49,7 @@ _TRY_A_COLUMN = (
 )
 _TAKE_IT_OUT = (
     'Curve and alarms can leave out {}: give the extended_model.json of this diagnosis to '
-    'identify --model and monitor --model, or to the node as model_file. Its b is the effect per '
-    'unit of the column; a1 and a2 correct the curve for the mean weather at low and high load.'
+    'identify --model and monitor --model, or to the node as model_file.'
 )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
+from valveflow_ros.curve.compensation import openings_seen
 from valveflow_ros.curve.shift import ShiftLimits, judge_shift, mixture_sentence, shift_json
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
@@ -52,8 +53,9 @@ from valveflow_ros.signals.units import in_unit
 
 CURVE = 'characteristic.json'
 STEP_TEST_ADVICE = (
-    'This looks like a manual step test (few openings, each held): --step-test identifies it '
-    'from its steady states.'
+    'This looks like a manual step test (few openings, each held). If the load controller was in '
+    'manual, --step-test identifies it from its steady states; for data of a closed loop do not '
+    'use it.'
 )
 
 
@@ -189,6 +191,11 @@ def identify(
         _step_test(log, given, progress) if step_test
         else _identified(log, given, model, reference, progress)
     )  # fmt: skip
+    opening, pressure = (
+        found.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
+    )
+    seen = openings_seen(opening, pressure)
+    found = replace(found, characteristic=replace(found.characteristic, openings_seen=seen))
     if reference is not None:
         settings = found.settings
         limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))

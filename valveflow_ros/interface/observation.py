@@ -273,36 +273,35 @@ def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None
         )
 
 
-def _longest_run(time_ns: IntArray, gap_ns: int) -> int:
-    """Return the largest number of rows in sequence without a time difference above a limit."""
-    ends = np.flatnonzero(np.diff(time_ns) > gap_ns) + 1
-    return int(np.diff([0, *ends.tolist(), len(time_ns)]).max())
-
-
 def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
     needed = [info.signal for info in _NEEDED]
     good = np.isfinite(table.values[:, needed]).all(axis=1)
-    usable, step_s = int(good.sum()), settings.real('sample_period')
-    span = duration(usable * step_s)
+    usable, longest = int(good.sum()), _longest_run(table.time_ns[good], settings)
+    span = duration(usable * settings.real('sample_period'))
     if not learnt:
-        first = duration(WARM_UP * WINDOW * settings.real('block'))
-        at_once = _longest_run(table.time_ns[good], round(1.5 * step_s * NS_PER_S))
-        whole = at_once == usable
-        if step_s >= COARSE_STEP_S:
-            rows = math.ceil(WARM_UP * WINDOW * settings.real('block') / step_s)
-            longest = '' if whole else f', at most {at_once} of them without a gap'
-            return (
-                f'The log holds {counted(usable, "usable row")}, one every {duration(step_s)}'
-                f'{longest}; it takes {rows} rows ({first}) without gaps to learn the noise of '
-                'the signals, and special segments after that to find the curve. Fewer rows, 12 '
-                'at least, are enough for a static test: steady rows at one pressure and several '
-                'openings.'
-            )
-        longest = '' if whole else f', at most {duration(at_once * step_s)} of it without a gap'
-        return (
-            f'The log holds {span} of usable data{longest}; it takes {first} without gaps to '
-            'learn the noise of the signals, and special segments after that to find the curve.'
+        stretch_s, step_s = WINDOW * settings.real('block'), settings.real('sample_period')
+        coarse = step_s >= COARSE_STEP_S
+        have = (
+            f'{counted(usable, "usable row")}, one every {duration(step_s)}'
+            if coarse
+            else f'{span} of usable data'
         )
+        if longest < usable:
+            most = longest if coarse else duration(longest * step_s)
+            have += f', at most {most} without a gap'
+        each = f'{math.ceil(stretch_s / step_s)} rows ' if coarse else ''
+        each += f'({duration(stretch_s)})' if coarse else duration(stretch_s)
+        told = (
+            f'The log holds {have}. To learn the noise of the signals it takes {WARM_UP} '
+            f'stretches of {each} without a gap, and special segments after that to find the '
+            'curve.'
+        )
+        if coarse:
+            told += (
+                ' Fewer rows, 12 at least, are enough for a static test: steady rows at one '
+                'pressure and several openings.'
+            )
+        return told
     least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
     return (
         f'No steady-state or slope-response segment was found in {span} of data: the valve must '
@@ -310,3 +309,9 @@ def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
         'A longer log, or shorter times by --set time_constant, delay, steady_min and slope_min, '
         'may help.'
     )
+
+
+def _longest_run(time_ns: IntArray, settings: Settings) -> int:
+    """Return the largest number of rows without a gap between."""
+    gaps = np.flatnonzero(np.diff(time_ns) > 1.5e9 * settings.real('sample_period'))
+    return int(np.diff(np.r_[-1, gaps, len(time_ns) - 1]).max())

@@ -18,6 +18,7 @@ from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, better_units
 
 # A pressure must be positive; the temperature is absolute zero.
 _LEAST_MPA, _COLDEST_DEGC = 1e-6, -273.15
+_VACUUM_MPA = 0.001, 0.1  # range of the pressure in a condenser
 _MANY = 0.02  # fraction of impossible values that is reported
 _MOST = 0.5  # above this fraction, the unit or the column is wrong
 
@@ -38,6 +39,9 @@ class Doubt:
         The message for the user, without the option that solves the problem.
     also : tuple of str
         Further units in which the values are usual.
+    other : bool
+        In the unit that was told, the values are usual for another quantity: it is rather the
+        column that is wrong than the unit.
     """
 
     signal: Signal
@@ -45,6 +49,7 @@ class Doubt:
     looks_like: str
     sentence: str
     also: tuple[str, ...] = ()
+    other: bool = False
 
     def advice(self, theirs: str) -> str:
         """Return the message with the exact option that helps; ``theirs`` is the column."""
@@ -52,6 +57,11 @@ class Doubt:
             return self.sentence
         topic = SIGNALS[self.signal].topic
         chosen = [option(topic, theirs, unit) for unit in (self.looks_like, *self.also)]
+        if self.other:
+            return (
+                f'{self.sentence} Name the right column with --column {topic}={THEIRS}[:unit]; if '
+                f'the unit is wrong, add {" or ".join(chosen)}'
+            )
         return f'{self.sentence} If so, add {" or ".join(chosen)}'
 
 
@@ -123,9 +133,19 @@ def doubt(
         )
     else:
         sentence = f'{info.topic}: {runs} and are taken as {unit}, which is unusual.'
-    if looks_like:
+    told = signal == Signal.MAIN_STEAM_PRESSURE and unit not in (info.unit, *DIFFERENCES)
+    other = (
+        steam
+        and told
+        and bool(_VACUUM_MPA[0] < float(values.min()) <= float(values.max()) < _VACUUM_MPA[1])
+    )
+    if other:
+        sentence += ' That is the pressure of a condenser, not of main steam'
+        wrong = f', unless {unit} is wrong and they are in {" or ".join(fitting)}'
+        sentence += f'{wrong}.' if looks_like else '.'
+    elif looks_like:
         sentence += f' They look like {" or ".join(fitting)}.'
-    return Doubt(signal, impossible, looks_like, sentence, fitting[1:])
+    return Doubt(signal, impossible, looks_like, sentence, fitting[1:], other)
 
 
 def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:
@@ -150,6 +170,7 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
                 f'{topic}={THEIRS}[:unit], or give --constant {topic}=VALUE'
             )
             remedy = choosing(topic, THEIRS)
+        remedy = choosing(topic, THEIRS) if found.other else remedy
         raise RefusedError(path, f"'{theirs}' is taken for {said}", [remedy], last=True)
 
 
@@ -175,6 +196,7 @@ def refuse_guesses(
                 said += f' If it is that signal all the same, add {chosen}; if not, name the right'
                 said += f' one with --column {topic}={THEIRS}[:unit]'
                 remedy = choosing(topic, THEIRS)
+            remedy = choosing(topic, THEIRS) if found.other else remedy
             said = said.removeprefix(f'{topic}: ')
             problems.append(f"'{theirs}' reads like {topic}, but {said}")
             remedies.append(remedy)

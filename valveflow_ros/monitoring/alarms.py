@@ -332,9 +332,9 @@ class ResidualAlarm(Alarm):
             return Content(value, _LIMIT, '', _sentence(state, shift_mw, self.onset_ns))
         side = 'more' if self._left_mw > 0.0 else 'less'
         sentence = (
-            f'The unit gave {abs(self._left_mw):.1f} MW {side} than its valve curve. Since then '
-            'the difference has been within the limit, but not for long enough at the openings of '
-            'the alarm.'
+            f'The unit gave {abs(self._left_mw):.1f} MW {side} than its valve curve (mean over '
+            'the loads seen). Since then the difference has been within the limit, but not for '
+            'long enough at the openings of the alarm.'
         )
         return Content(value, _LIMIT, '', sentence)
 
@@ -355,13 +355,17 @@ def _sentence(state: AlarmState, shift_mw: float, onset_ns: int) -> str:
         return 'The unit does not follow its valve curve; the difference in MW is not known.'
     if state == AlarmState.UNACKNOWLEDGED:
         return (
-            f'The unit gives {abs(shift_mw):.1f} MW {side} than its valve curve{since}. '
+            f'The unit gives {abs(shift_mw):.1f} MW {side} than its valve curve (mean over the '
+            f'loads seen){since}. '
             'Check what changed then. If the change was intended, request a new curve (~/refit).'
         )
     if state == AlarmState.ACKNOWLEDGED and not known:
         return 'Acknowledged; the difference in MW is not known yet.'
     if state == AlarmState.ACKNOWLEDGED:
-        return f'Acknowledged; the unit still gives {abs(shift_mw):.1f} MW {side} than expected.'
+        return (
+            f'Acknowledged; the unit still gives {abs(shift_mw):.1f} MW {side} than its valve '
+            'curve (mean over the loads seen).'
+        )
     if state == AlarmState.RETURNED_UNACKNOWLEDGED:
         return 'The unit follows the valve curve again; acknowledge to clear the alarm.'
     return 'The unit follows the valve curve.'

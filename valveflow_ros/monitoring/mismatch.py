@@ -351,6 +351,7 @@ class Mismatch(Memory):
     def _hint(self, j: int, effect: float, place: Callable[[float], str]) -> str:
         """Return the meaning of a statistic in words; ``effect`` in MW."""
         size, side = f'{abs(effect):.2g} MW', 'more' if effect > 0.0 else 'less'
+        mean = '(mean over the loads seen)'
         if j >= BIN:
             low, high = self._ends
             at = low + (high - low) * (j - BIN) / (BINS - 1)
@@ -365,8 +366,10 @@ class Mismatch(Memory):
             apart = f'{2.0 * abs(effect):.2g} MW'
             return f'at the same opening the power differs by {apart} between opening and closing'
         return {
-            OFFSET: f'the unit gives {size} {side} than the model predicts',
-            GAIN: f'the unit gives {size} {side} than the model predicts, in proportion to load',
-            INPUT: f'where the curve is steep it gives {size} {side} than the model predicts',
-            TEMPERATURE: f'the power changes with the main steam temperature, by {size}',
-        }.get(j, f'the power varies with the time of day, by {size}')
+            OFFSET: f'the unit gives {size} {side} than the model predicts {mean}',
+            GAIN: f'the unit gives {size} {side} than the model predicts {mean}, in proportion to '
+            'the load',
+            INPUT: f'the unit gives {size} {side} than the model predicts {mean}, most where the '
+            'curve is steep',
+            TEMPERATURE: f'the power changes with the main steam temperature, by {size} {mean}',
+        }.get(j, f'the power varies with the time of day, by {size} {mean}')

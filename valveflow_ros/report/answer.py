@@ -16,7 +16,7 @@ from valveflow_ros.curve.characteristic import (
     piece_of,
 )
 from valveflow_ros.fit.model_form import Misfit
-from valveflow_ros.fit.result import forms_apart, wrong_form
+from valveflow_ros.fit.result import forms_apart, is_borrowed, wrong_form
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
 from valveflow_ros.report.identified import Identified
@@ -292,7 +292,13 @@ def _rests(c: Characteristic, k: int) -> list[str]:
         f'{counted(found.steady, "steady state")} at {counted(len(found.levels), "level")}, '
         f'{counted(found.slope_response, "slope response")}'
     )
-    return [said if found.identifiable else f'<b>not identifiable by itself</b>: {said}']
+    if found.identifiable:
+        return [said]
+    return [
+        f'{said}; the slope follows from the pieces beside it'
+        if is_borrowed(c.pieces[k])
+        else f'<b>slope uncertain</b>: {said}'
+    ]
 
 
 def breakpoints_table(c: Characteristic) -> str:

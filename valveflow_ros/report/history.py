@@ -501,7 +501,9 @@ def _curves(history: History) -> list[str | Figure]:
     if np.isfinite(moved):
         last = found[-1]
         place = f'{decimals(float(np.interp(at, last.u, last.power_mw)), 0)} MW'
-        place = place if last.exponent else f'{decimals(at, 1)} % opening'
+        place += (
+            f' (u = {decimals(at, 0)})' if last.exponent else f' ({decimals(at, 1)} % opening)'
+        )
         words += (
             f' The last curve differs most from the median of the earlier ones at '
             f'{place}, by {decimals(moved, 2)} MW.'

@@ -9,6 +9,7 @@ import math
 from argparse import ArgumentParser, Namespace
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,11 @@ the table, so that linear interpolation is exact. The command reports where the 
 be used.
 
 u is V p^m, with the opening V in % and the pressure p in MPa. For a valve with breakpoints at
-fixed openings, p^m F(V) + c, u is the opening, and a table is valid for one pressure only.
+fixed openings, p^m F(V) + c, u is the opening, and the power belongs to one pressure: several
+--pressure give one table below the other, with the pressure as the first column. A controller
+interpolates between them by the pressure.
+
+Columns named seen are 1 where identify saw this opening at about this pressure, else 0.
 
 example:
   valveflow compensate --model result/characteristic.json -o table.csv --pressure 16.7"""
@@ -56,8 +61,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         '--pressure', metavar='MPA', action='append', default=[],
         type=number('a pressure in MPa', 1e-6, 100, '--pressure 16.7'),
-        help='add a column with the opening at this main steam pressure; may be repeated, '
-        'except for a curve with breakpoints at fixed openings',
+        help='add a column with the opening at this main steam pressure; may be repeated',
     )  # fmt: skip
     parser.add_argument(
         '--max-gain', metavar='G',
@@ -89,55 +93,96 @@ def run(options: Namespace, console: Console) -> VerbResult:
     check_output(options.output, TABLES, source=options.model, overwrite=options.overwrite)
     curve = load_characteristic(options.model)
     console.measured_in(curve.output_unit)
-    pressures, shown = sorted(set(options.pressure)), curve
+    pressures = sorted(set(options.pressure))
+    shown = [(curve, pressures)]
     if curve.axis == OPENING:
-        # At each pressure its breakpoints are at other powers.
-        if len(pressures) > 1:
-            raise UsageError(
-                'The breakpoints of this curve are at fixed openings, and at another power for '
-                'each pressure: make one table for each --pressure. A unit with sliding pressure '
-                'needs several, between which the controller interpolates by the pressure.'
-            )
         if not pressures and math.isnan(curve.reference_pressure_mpa):
             raise UsageError(
                 'The power of this curve at an opening depends on the pressure, and its file '
                 'states no reference pressure: give one, as in --pressure 16.7.'
             )
-        shown = curve.at_pressure(*pressures)
-        pressures = [shown.reference_pressure_mpa]
+        # At each pressure its breakpoints are at other powers.
+        at = pressures or [curve.reference_pressure_mpa]
+        shown = [(curve.at_pressure(p), [p]) for p in at]
 
-    def make(points: int) -> Compensation:
+    def make(cut: Characteristic, points: int) -> Compensation:
         return compensate(
-            shown, points, options.max_gain,
+            cut, points, options.max_gain,
             -math.inf if options.u_from is None else options.u_from,
             math.inf if options.u_to is None else options.u_to,
         )  # fmt: skip
 
-    made = make(options.points)
-    _check(made, options.tolerance, make)
-    for sentence in (*curve.notes, *_far(curve, pressures), *made.notes[1:]):
+    tables, texts, data = [], [], []
+    for sentence in (*curve.notes, *_far(curve, [p for _, at in shown for p in at])):
         console.warn(sentence)
-    table = _table(made, pressures)
-    _write(table, options.output)
-    text = _text(made, pressures, options.tolerance, options.output)
+    for cut, shown_at in shown:
+        made = make(cut, options.points)
+        _check(made, options.tolerance, partial(make, cut))
+        tables.append(_table(made, shown_at))
+        for sentence in (*made.notes[1:], *_unseen(tables[-1], curve, shown_at)):
+            console.warn(sentence)
+        texts.append(_text(made, shown_at, options.tolerance, options.output))
+        data.append(_data(made, tables[-1], shown_at, options.tolerance, options.output))
+    _write(tables[0] if len(shown) == 1 else _stacked(tables, pressures), options.output)
     form = {
         'axis': curve.axis,
         'pressure_exponent': curve.pressure_exponent,
         'pressure_scale_exponent': curve.pressure_scale_exponent,
         'offset_mw': curve.offset_mw,
     }
-    data = _data(made, table, pressures, options.tolerance, options.output)
-    return VerbResult(text, {**form, **data})
+    if len(shown) == 1:
+        return VerbResult(texts[0], {**form, **data[0]})
+    text = '\n'.join(f'At {p:g} MPa:\n{one}' for p, one in zip(pressures, texts, strict=True))
+    return VerbResult(text, {**form, 'table': str(options.output), 'tables': data})
+
+
+def _unseen(
+    table: Mapping[str, FloatArray], curve: Characteristic, pressures: Sequence[float]
+) -> list[str]:
+    """Return a warning for each pressure at which openings of the table were not seen."""
+    from valveflow_ros.curve.compensation import seen_at
+    from valveflow_ros.report.words import counted
+
+    told = []
+    for p in pressures:
+        marks = table.get(_seen_column(p))
+        if marks is None or marks.all():
+            continue
+        seen, rows = seen_at(curve, p), counted(int((marks == 0.0).sum()), 'row')
+        where = f'from {seen[0]:.1f} to {seen[1]:.1f} % opening only' if seen else 'at no opening'
+        told.append(
+            f'At about {p:g} MPa identify saw the unit {where}: {rows} of the table, marked 0 as '
+            'not seen, come from other pressures by the law of the pressure.'
+        )
+    return told
+
+
+def _stacked(
+    tables: Sequence[Mapping[str, FloatArray]], pressures: Sequence[float]
+) -> dict[str, FloatArray]:
+    """Return tables of one pressure each as one table with the pressure as first column."""
+    import numpy as np
+
+    rows = [len(table['u']) for table in tables]
+    stacked = {'pressure_mpa': np.repeat(np.array(pressures), rows)}
+    names = [{name.partition('_at_')[0]: column for name, column in t.items()} for t in tables]
+    return stacked | {name: np.concatenate([t[name] for t in names]) for name in names[0]}
+
+
+def _seen_column(pressure: float) -> str:
+    return f'seen_at_{pressure:g}_mpa'
 
 
 def _far(curve: Characteristic, pressures: Sequence[float]) -> list[str]:
     """Return a warning for each pressure that is far from that of the data."""
+    from valveflow_ros.curve.compensation import seen_at
+
     usual = curve.reference_pressure_mpa
     return [
         f'The usual pressure of the data was {usual:.1f} MPa. At {p:g} MPa the table rests on the '
         'law of the pressure alone: do not use it where the unit did not run.'
         for p in pressures
-        if abs(p - usual) > _FAR * usual
+        if abs(p - usual) > _FAR * usual and seen_at(curve, p) is None
     ]
 
 
@@ -178,6 +223,8 @@ def _table(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArr
     """Return the columns of the table; opening in % of full opening, not limited to 100."""
     import numpy as np
 
+    from valveflow_ros.curve.compensation import seen_at
+
     exponent = made.curve.pressure_exponent
     table = {
         'power_mw': made.power_mw,
@@ -187,7 +234,11 @@ def _table(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArr
         'within_gain_limit': made.within.astype(np.float64),
     }
     for p in pressures:
-        table[f'opening_percent_at_{p:g}_mpa'] = np.round(made.u / p**exponent, 6)
+        opening = np.round(made.u / p**exponent, 6)
+        table[f'opening_percent_at_{p:g}_mpa'] = opening
+        if made.curve.openings_seen:
+            low, high = seen_at(made.curve, p) or (math.inf, -math.inf)
+            table[_seen_column(p)] = ((opening >= low) & (opening <= high)).astype(np.float64)
     return table
 
 

@@ -54,7 +54,10 @@ def arguments(parser: ArgumentParser) -> None:
         help="leave out the monitor's own diagnoses; each log is diagnosed once all the same",
     )  # fmt: skip
     parser.add_argument(
-        '--params', metavar='FILE', type=Path, help='parameters, a YAML file as the node takes it'
+        '--params',
+        metavar='FILE',
+        type=Path,
+        help='parameters: a YAML file as the node takes it, or with one NAME: VALUE in a line',
     )
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',

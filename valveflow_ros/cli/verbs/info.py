@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _LARGE_BYTES = 20_000_000  # smaller files are read without noticeable delay
 _GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 
+_OTHER_NS = 60 * 10**9  # beyond it, times of messages and of their values differ
 _DESCRIPTION = """\
 Look into a log before working with it: its span, topics and rates, the range of each signal,
 gaps, values that will be rejected and why, attachments, and whether anything is damaged.
@@ -65,6 +66,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
     counts = _fates(log.recorded, parts, settings)
     contents = log.contents
     start, end = contents.start_ns, contents.end_ns
+    times = log.recorded.time_ns
+    data_ns = (int(times.min()), int(times.max())) if len(times) else (None, None)
     seconds = 0.0 if start is None or end is None else (end - start) / 1e9
     signals = {
         info['topic']: info
@@ -77,6 +80,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         'start_ns': None if end is None else start,
         'end_ns': None if start is None else end,
         'duration_s': seconds,
+        'data_start_ns': data_ns[0],
+        'data_end_ns': data_ns[1],
         'topics': [
             {
                 'name': t.name,
@@ -111,6 +116,14 @@ def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
     if data['start_ns'] is not None:
         span = f'  {moment(data["start_ns"])} to {moment(data["end_ns"])} '
         span += f'({duration(data["duration_s"])})'
+    # In a replay the messages have times of their own besides those of the values.
+    ends = ((data[f'data_{end}'], data[end]) for end in ('start_ns', 'end_ns'))
+    if any(None not in pair and abs(pair[0] - pair[1]) > _OTHER_NS for pair in ends):
+        first, last = data['data_start_ns'], data['data_end_ns']
+        span = lines(
+            f'  data: {moment(first)} to {moment(last)} ({duration((last - first) / 1e9)})',
+            f'  recorded: {span.strip()}' if span else '',
+        )
     topics = [
         [
             t['name'], t['type'], count(t['messages']),

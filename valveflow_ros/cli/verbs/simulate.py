@@ -24,7 +24,8 @@ pressure, primary-frequency pulses and noise, written down once a second. Effect
 misbehave in a known way, to see whether that is found.
 
 --unit takes another one, of about 330 MW, with boiler, governor, AGC, reheater and condenser:
-  choked            one group of valves, flow p^m f(V), sliding pressure
+  choked            one group of valves; the pressure behind them never reduces the flow (choked
+                    flow, p^m f(V)), sliding pressure. The effect of this name is the opposite
   sequence          three or four valves that open one after the other, sliding pressure
   integrated_input  the paper's form g(V p^m), sliding pressure
 and choked_fixed, sequence_fixed, integrated_input_fixed at fixed pressure. "choked:number=7" is

@@ -32,6 +32,10 @@ CONTRADICTED_GAIN = 25.0
 LEAST_ANSWER = 3.0
 """Log-likelihood by which the command must help to predict the response."""
 LEAST_PERIODS = 3.0
+_DOUBT = (
+    'A process that changes unmeasured, such as a varying supply pressure, can look the same: '
+    'with the controller in manual, steps of the command in both directions tell.'
+)
 _MOST_ROWS = 20_000
 _WINDOW_ROWS = 1000  # the thresholds were determined on windows of 751 rows
 _MOST_FILLED = 3
@@ -122,8 +126,13 @@ def judge_response(
     found = [_judged(c[p], y[p], None if aim is None else aim[p], step_s, group) for p in parts]
     if len(found) > 1 and all(one.verdict == NOT_JUDGED for one in found):
         # Oscillations too slow for one part may be visible in the whole record.
-        return _judged(c, y, aim, step_s, -(-len(c) // _WINDOW_ROWS))
-    return found[0] if len(found) == 1 else _together(found)
+        return _doubted(_judged(c, y, aim, step_s, -(-len(c) // _WINDOW_ROWS)))
+    return _doubted(found[0] if len(found) == 1 else _together(found))
+
+
+def _doubted(found: LoopJudgement) -> LoopJudgement:
+    """Return a judgement with what else may look like its fault."""
+    return replace(found, reason=f'{found.reason} {_DOUBT}') if found.verdict in FAULTS else found
 
 
 def _judged(
