@@ -62,7 +62,7 @@ test-versions: setup
 	  [ -z "$$failed" ] || { echo "test-versions: failed with$$failed" >&2; exit 1; }
 
 test-slow: setup
-	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m 'slow or hypothesis' \
+	@$(ENV) VALVEFLOW_REQUIRE_ROS=1 VALVEFLOW_SLOW=1 python -m pytest -m 'slow or long or hypothesis' \
 	  $(PYTEST_ARGS)
 
 lint: setup

@@ -14,7 +14,7 @@ import pytest
 MIB = 1 << 20
 
 
-@pytest.mark.parametrize('limit_mib', [300, 700, 1100, 2000])
+@pytest.mark.parametrize('limit_mib', [300, 700, pytest.param(1100, marks=pytest.mark.long), 2000])
 @pytest.mark.parametrize('verb', ['info', 'identify'])
 def test_a_limited_process_works_or_says_what_it_needs(
     verb: str, limit_mib: int, tmp_path: Path

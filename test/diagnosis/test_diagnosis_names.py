@@ -41,10 +41,11 @@ FULL_MW = 295.0  # where the curve of the paper's unit is flat
         ('temperature:k=-0.0016', 'k', -0.0016, None),
         ('gain_step:g=0.008,t0_days=0.9', 'g', 0.008, 0.008 * FULL_MW),
         ('output_offset_drift:b_mw=17', 'b_mw', 17.0, 17.0 * SHORT / 10.0),
-        ('gain_step:g=-0.04,t0_days=0.9', 'g', -0.04, -0.04 * FULL_MW),
+        pytest.param('gain_step:g=-0.04,t0_days=0.9', 'g', -0.04, -0.04 * FULL_MW,
+                     marks=pytest.mark.long),
         ('backlash:w_percent=0.8', 'w_percent', 0.8, None),
     ],
-)
+)  # fmt: skip
 def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth, at_full_load_mw):
     found = diagnosed(effect, days=SHORT)
     name = effect.partition(':')[0]
@@ -114,18 +115,17 @@ def test_a_slow_change_of_another_shape_is_told_by_it_and_gets_no_name():
     assert told_mw == pytest.approx(change_mw[-1], rel=0.3)
 
 
-@pytest.mark.slow
+# `make study-diagnosis` does more.
+@pytest.mark.long
 @pytest.mark.parametrize('what', list(COURSES))
 def test_every_shape_is_told(what):
-    if os.environ.get('VALVEFLOW_SLOW') != '1':
-        pytest.skip('make test-slow runs it; make study-diagnosis does more')
     told_mw, change_mw = changed_slowly(what, 5.0)
     most = change_mw[np.abs(change_mw).argmax()]
     truth = change_mw[np.flatnonzero(change_mw)[0]] if what == 'two steps' else most
     assert told_mw == pytest.approx(truth, rel=0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     'effect',
     [
@@ -146,17 +146,14 @@ def test_every_shape_is_told(what):
     ],
 )
 def test_every_family_is_told_from_the_others(effect):
-    if os.environ.get('VALVEFLOW_SLOW') != '1':
-        pytest.skip('make test-slow runs it; make study-diagnosis does more')
     found = diagnosed(effect)
     assert names(found) == {effect.partition(':')[0]}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('h_mw', [-2.0, 2.0])
 @pytest.mark.parametrize('seed', [3, 8])
 def test_a_bump_is_not_called_a_dent(h_mw, seed):
-    if os.environ.get('VALVEFLOW_SLOW') != '1':
-        pytest.skip('make test-slow runs it; make study-diagnosis does more')
     found = diagnosed(f'curve_shape:h_mw={h_mw},u0=1425,width_u=150', seed=seed)
     assert names(found) == {'curve_shape'}
     height = found.causes[0].parameters['h_mw']

@@ -73,15 +73,16 @@ def test_twice_the_power_is_twice_the_curve() -> None:
     np.testing.assert_allclose(2.0 * one.values(), two.values(), rtol=1e-6)
 
 
-def test_one_line_stays_one_piece() -> None:
-    """Noise makes no knee: in at most one of twenty tests of a straight valve."""
+@pytest.mark.parametrize(('seeds', 'most'), [(6, 1), pytest.param(20, 2, marks=pytest.mark.long)])
+def test_one_line_stays_one_piece(seeds: int, most: int) -> None:
+    """Noise makes no knee, but in a few tests of a straight valve."""
     more = 0
-    for seed in range(20):
+    for seed in range(seeds):
         frame = flow_test(seed)
         rng = np.random.default_rng(seed)
         line = 3.0 * frame['valve_opening_percent'] + rng.normal(0.0, 0.5, len(frame))
         more += len(vf.identify(frame.assign(generated_power_mw=line)).characteristic.pieces) > 1
-    assert more <= 2
+    assert more <= most
 
 
 @pytest.mark.parametrize('seed', [1, 2, 11])

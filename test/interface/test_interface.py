@@ -474,8 +474,11 @@ class TestOtherUnits:
         assert table['main_steam_pressure_mpa'].isna().mean() > 0.3
 
     @pytest.mark.parametrize(
-        ('unit', 'seed'), [('choked:number=1', 1), ('sequence:number=9', 21),
-                           ('integrated_input:number=3', 3)],
+        ('unit', 'seed'), [
+            ('choked:number=1', 1),
+            pytest.param('sequence:number=9', 21, marks=pytest.mark.long),
+            pytest.param('integrated_input:number=3', 3, marks=pytest.mark.long),
+        ],
     )  # fmt: skip
     def test_a_compressed_log_is_identified(self, tmp_path, unit, seed):
         plant = vf.simulate(8, seed, unit=unit, recording='compressed')

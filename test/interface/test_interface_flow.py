@@ -36,7 +36,9 @@ def flow(frame, factor, unit='t/h'):
     return vf.open_log(scaled, columns={'generated_power': f'{POWER}:{unit}'})
 
 
-@pytest.mark.parametrize(('factor', 'unit'), [(0.01, 'kg/s'), (3.0, 't/h'), (1e4, 'lb/h')])
+@pytest.mark.parametrize(('factor', 'unit'), [
+    (0.01, 'kg/s'), pytest.param(3.0, 't/h', marks=pytest.mark.long), (1e4, 'lb/h'),
+])  # fmt: skip
 def test_a_scaled_output_gives_the_scaled_curve(frame, usual, factor, unit):
     found = curve_of(flow(frame, factor, unit))
     assert found.output_unit == unit

@@ -69,7 +69,7 @@ def test_a_unit_of_the_paper_s_form_keeps_it():
     assert error_mw(plant(unit=unit), found.characteristic) < 1.0
 
 
-@pytest.mark.parametrize('seed', [401, 406])
+@pytest.mark.parametrize('seed', [401, pytest.param(406, marks=pytest.mark.long)])
 def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
     simulation = vf.simulate(4.0, seed, unit=f'sequence:number={seed}')
     curve = vf.identify(simulation.log).characteristic

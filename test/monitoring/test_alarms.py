@@ -378,7 +378,7 @@ DAY_NS = 86_400 * NS_PER_S
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('seed', [21, 22])
+@pytest.mark.parametrize('seed', [21, pytest.param(22, marks=pytest.mark.long)])
 def test_a_healthy_plant_calls_at_most_once_in_ten_minutes_for_days(seed):
     monitor, events = run(SEDATE, simulate(2.5, seed).table, {90_000: 'set_reference'})
     assert monitor.characteristic is not None

@@ -169,18 +169,19 @@ def scalars(state, at=()):
 
 
 @pytest.mark.parametrize(
-    'value',
-    [np.nan, np.inf, -1, 0, 10**400, 'x', None, [], True],
+    ('number', 'value'),
+    list(enumerate([np.nan, np.inf, -1, 0, 10**400, 'x', None, [], True])),
     ids=lambda value: repr(value)[:9],
 )
-def test_a_state_with_one_value_changed_is_refused_or_goes_on(value):
+@pytest.mark.parametrize('every', [3, pytest.param(1, marks=pytest.mark.long)])
+def test_a_state_with_one_value_changed_is_refused_or_goes_on(number, value, every):
     """What is refused is so before the first row; the restart catches these errors."""
     caught = (DataError, LookupError, TypeError, ValueError, AttributeError)
     table = plant_table(2, 1560)
     first = Monitor(SETTINGS)
     feed_rows(first, table.part(0, 1500))
     saved, refused, tried = first.snapshot(), 0, 0
-    for path in scalars(saved):
+    for path in list(scalars(saved))[number % every :: every]:
         state = copy.deepcopy(saved)
         inside = state
         for key in path[:-1]:
@@ -195,7 +196,7 @@ def test_a_state_with_one_value_changed_is_refused_or_goes_on(value):
             continue
         feed_rows(second, table.part(1500, 1560))
         assert from_bytes(to_bytes(second.snapshot())), path
-    assert tried > 100
+    assert tried > 100 / every
     if value in (10**400, 'x'):
         assert refused > 0.3 * tried
     if value == 10**400:

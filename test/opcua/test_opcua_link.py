@@ -327,10 +327,8 @@ def test_a_server_that_stops_answering_is_left(run, server):
     relay.close()
 
 
-@pytest.mark.parametrize('times', [1, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize('times', [1, pytest.param(50, marks=pytest.mark.long)])
 def test_a_server_that_is_killed_and_started_again(run, times):
-    if times > 1 and not os.environ.get('VALVEFLOW_SLOW'):
-        pytest.skip('minutes; VALVEFLOW_SLOW=1 runs it')
     server = OpcUaServer(free_port())
     link = run(mapping(server.port))
     for k in range(times):

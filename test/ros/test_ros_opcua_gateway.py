@@ -334,10 +334,8 @@ def test_the_history_of_an_outage_is_a_recording(tmp_path):
     assert len(vf.open_log(path).readings) == 8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demo_tells_its_story(processes, tmp_path):
-    if not os.environ.get('VALVEFLOW_SLOW'):
-        pytest.skip('a minute; VALVEFLOW_SLOW=1 runs it')
     demo = processes.start('valveflow_ros.ros.opcua_demo', '--output', str(tmp_path / 'demo'))
     assert demo.wait(300) == 0
     told = processes.output(demo)
