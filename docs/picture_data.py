@@ -65,7 +65,7 @@ CASES = {
     'output_offset_drift': Case('b_mw=8', ('time', 'map time')),
     'rate_limit': Case('r_percent_per_s=0.06', ('fast moves', 'ramp')),
     'region_lag': Case('time_s=200,delay_s=10,level_mw=270', ('fast moves', 'ramp'), earlier=True),
-    'reheater': Case('alpha=0.3,time_s=60', ('fast moves', 'ramp')),
+    'reheater': Case('alpha=0.3,time_s=120', ('fast moves', 'ramp')),
     'saturation': Case('max_percent=82', ('u', 'map pressure given u')),
     'stiction': Case('s_percent=2,j_percent=1.4', ('direction', 'fast moves')),
     'temperature': Case('k=-0.0015', ('temperature', 'time')),

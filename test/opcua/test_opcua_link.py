@@ -111,7 +111,9 @@ def keys(tmp_path_factory):
     """Certificates and keys as files, by name."""
     folder = tmp_path_factory.mktemp('keys')
     names = {'gateway': 30.0, 'server': 30.0, 'other': 30.0, 'old': -1.0}
-    return {name: certificate(folder, name, days) for name, days in names.items()}
+    found = {name: certificate(folder, name, days) for name, days in names.items()}
+    (folder / 'damaged.der').write_bytes(b'no certificate')
+    return {**found, 'damaged': (str(folder / 'damaged.der'), '')}
 
 
 @pytest.fixture(scope='module')
@@ -181,7 +183,9 @@ def test_an_unknown_node_is_named_and_the_others_go_on(run, server):
     assert list(link.samples[-1].quality[:2]) == [Quality.BAD] * 2
 
 
-@pytest.mark.parametrize('trusted', [['server'], ['old', 'other', 'server']], ids=str)
+@pytest.mark.parametrize(
+    'trusted', [['server'], ['old', 'other', 'server'], ['damaged', 'server']], ids=str
+)
 def test_an_encrypted_link_with_user_and_password(run, secured, keys, tmp_path, trusted):
     (tmp_path / 'password').write_text('secret\n')
     content = secure(keys, secured.port, trusted=trusted)
@@ -206,6 +210,7 @@ SECURITY = [
     ({'trusted': ['old']}, 'old.der: expired on'),
     ({'trusted': ['other']}, "does not have the one named as 'trusted'"),
     ({'trusted': ['other', 'old']}, "The server has none of the certificates named as 'trusted'"),
+    ({'trusted': ['other', 'damaged']}, 'damaged.der: is no certificate that can be read'),
     ({'own': 'other'}, 'the server does not accept the user'),
     ({}, 'the server does not accept the user'),
     ({'policy': 'Basic256Sha256'}, 'does not offer this policy'),

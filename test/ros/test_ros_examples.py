@@ -26,7 +26,7 @@ from valveflow_ros.records import SIGNALS
 pytestmark = pytest.mark.ros
 # Executable: its module, what it says once it works, and what it needs.
 EXECUTABLES = {
-    'monitor': ('monitor_main', 'Recording to|recording', ''),
+    'monitor': ('monitor_main', r'U1: listening to .*; recording to /', ''),
     'page': ('page_main', 'The page is at', 'dash'),
     'watch': ('watch_main', 'Waiting for /unit1/valveflow_monitor', ''),
     'replay': ('replay_main', 'Playing plant.mcap', ''),

@@ -247,7 +247,7 @@ def test_what_a_monitor_says_is_read_by_opc_ua(processes, context, server, tmp_p
     assert gateway.wait(20) == 0
 
 
-@pytest.mark.parametrize('readers', [['dcs', 'old'], ['old']], ids=str)
+@pytest.mark.parametrize('readers', [['dcs', 'old', 'damaged'], ['old']], ids=str)
 def test_an_expired_certificate_of_a_reader_stops_nobody_else(
     processes, server, tmp_path, readers
 ):
@@ -256,6 +256,8 @@ def test_an_expired_certificate_of_a_reader_stops_nobody_else(
 
     keys = {name: certificate(tmp_path, name) for name in ('gateway', 'dcs', 'stranger')}
     keys['old'] = certificate(tmp_path, 'old', -1.0)
+    (tmp_path / 'damaged.der').write_bytes(b'no certificate')
+    keys['damaged'] = (str(tmp_path / 'damaged.der'), '')
     endpoint = f'opc.tcp://127.0.0.1:{free_port()}'
     content = mapping(server.port, server={
         'endpoint': endpoint,
@@ -268,6 +270,8 @@ def test_an_expired_certificate_of_a_reader_stops_nobody_else(
     day = f'{datetime.now(timezone.utc) - timedelta(days=1):%Y-%m-%d}'
     assert f'{keys["old"][0]}: expired on {day}; the client that has it is refused.' in told
     assert 'WARN' in told
+    damaged = f'{keys["damaged"][0]}: is no certificate that can be read; the client that has it '
+    assert (f'{damaged}is refused.' in told) is ('damaged' in readers)
 
     async def connect(name):
         client = Client(endpoint, timeout=10)

@@ -229,7 +229,7 @@ def add_mapping(parser: ArgumentParser) -> None:
     parser.epilog = MAPPING_HELP
     parser.add_argument(
         '--column', action='append', default=[], metavar='NAME=THEIRS[:UNIT]',
-        help='which column or topic of yours is the signal NAME, and its unit if it is not the '
+        help='your column or topic for the signal NAME, and its unit if it is not the '
         'usual one; may be given several times',
     )  # fmt: skip
     parser.add_argument(
@@ -242,19 +242,20 @@ def add_mapping(parser: ArgumentParser) -> None:
 def add_table(parser: ArgumentParser, gathered: str) -> None:
     """Add the options on the format of a table, collected under the name ``gathered``."""
     parser.set_defaults(**{gathered: []})
-    about = parser.add_argument_group('how a table is written, where it does not show it itself')
+    about = parser.add_argument_group('format of a table, if it is not recognised')
     for option, metavar, told in (
         ('time-zone', 'ZONE',
-         'zone of times that name none, and of those told to you, such as Europe/Berlin or '
-         '+01:00; west of Greenwich with an equals sign, --time-zone=-05:00 (default: UTC)'),
+         'time zone of times without one in the table, and of the times shown, such as '
+         'Europe/Berlin or +01:00; west of Greenwich with an equals sign, --time-zone=-05:00 '
+         '(default: UTC)'),
         ('date-order', 'dmy|mdy',
          'whether 01/02/2026 is in February (dmy) or in January (mdy)'),
-        ('decimal', 'point|comma', 'what stands before the decimals of a number'),
+        ('decimal', 'point|comma', 'decimal mark of numbers'),
         ('sheet', 'NAME', 'which sheet of a workbook'),
         ('max-unpacked', 'MB',
          'largest unpacked size of a table (default: 64 MB or 200 times the size of the file, '
          'whichever is larger; at most 1074 MB for a workbook and 2147 MB for Parquet)'),
-        ('period', 'TIME', 'time from one row to the next, such as 60s or 1min, where no column '
+        ('period', 'TIME', 'time from one row to the next, such as 60s or 1min, if no column '
          'holds times; the first row is then at 2000-01-01'),
     ):  # fmt: skip
         about.add_argument(
@@ -307,7 +308,7 @@ def add_analysis_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--table', action='store_true',
-        help='also write what each picture shows as CSV: DIR/tables',
+        help='also write the data of each picture as CSV: DIR/tables',
     )  # fmt: skip
     for name, option, what in (('start', '--from', 'first'), ('end', '--to', 'last')):
         parser.add_argument(

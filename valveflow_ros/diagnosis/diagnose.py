@@ -648,7 +648,7 @@ def _conclude(
     changed, alike = (since, '') if isinstance(since, Change) else (None, since)
     earlier = () if changed is None else (changed.cause(found.task, models[0]),)
     verdict, dropped = _verdict(found, rest, bool(earlier + outside))
-    near = tuple(dict.fromkeys(n for c in causes for n in c.not_told_apart))
+    near = tuple(dict.fromkeys(n for c in earlier + causes for n in c.not_told_apart))
     if verdict == UNEXPLAINED:
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
     causes = () if dropped else causes
@@ -659,7 +659,7 @@ def _conclude(
     explained = rest.structure.explained_mw2 if rest.structure.there else 0.0
     result = Diagnosis(
         verdict=verdict, sentence='', causes=earlier + causes + outside,
-        not_told_apart=near, experiments=_experiments(causes),
+        not_told_apart=near, experiments=_experiments(earlier + causes),
         disturbance=rest.disturbance,
         unexplained_by=unexplained, rejected=tuple(found.reasons.items()),
         rmse_simulation=before, rmse_extended=after,

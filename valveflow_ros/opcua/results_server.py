@@ -10,7 +10,7 @@ import hmac
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.opcua.mapping import Security, ServerSettings, User
 from valveflow_ros.opcua.session import (
     connected,
@@ -107,23 +107,28 @@ class ResultsServer:
         self._one = asyncio.Lock()
 
     async def start(self) -> list[str]:
-        """Start the server; return warnings about client certificates that are not valid now.
+        """Start the server; return warnings about client certificates that cannot be used.
 
         Raises
         ------
         DataError
             If the address is in use or does not belong to this machine.
         RecordingError
-            If a certificate or key cannot be used.
+            If the server's own certificate or key cannot be used.
         """
         from asyncua import Server, ua
 
         settings, security = self._settings, self._settings.security
         told, trusted = [], None
         if not security.none:
-            trusted = [read_certificate(path) for path in security.trusted]
-            for path, found in zip(security.trusted, trusted, strict=True):
-                if problem := not_valid(found):
+            trusted = []
+            for path in security.trusted:
+                try:
+                    trusted.append(read_certificate(path))
+                    problem = not_valid(trusted[-1])
+                except RecordingError as error:
+                    problem = error.problem
+                if problem:
                     told.append(f'{path}: {problem}; the client that has it is refused.')
         self._server = server = Server(user_manager=_Readers(trusted, settings.user))
         await server.init()

@@ -166,11 +166,18 @@ async def _server_certificate(endpoint: str, trusted: Sequence[Path]) -> Certifi
     asking = Client(endpoint, timeout=ANSWER_S)
     told = await asyncio.wait_for(asking.connect_and_get_server_endpoints(), 2.0 * ANSWER_S)
     theirs = {bytes(e.ServerCertificate) for e in told if e.ServerCertificate}
+    unreadable: RecordingError | None = None
     for path in trusted:
-        own = read_certificate(path).public_bytes(Encoding.DER)
+        try:
+            own = read_certificate(path).public_bytes(Encoding.DER)
+        except RecordingError as error:
+            unreadable = error
+            continue
         # A server may send its certificate chain, which begins with its own certificate.
         if any(chain.startswith(own) for chain in theirs):
             return load_certificate(path)
+    if unreadable is not None:  # it may be that of the server
+        raise unreadable
     raise DataError("The server has none of the certificates named as 'trusted'.")
 
 

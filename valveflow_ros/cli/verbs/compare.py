@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Identify the flow characteristic in three ways - from special segments, as a Hammerstein model
-and by sparse identification - and judge all of them on data none has seen, as Section IV of
-the paper does: parameters, mean squared errors in special segments, paired t tests. DIR gets
-report.html for people, comparison.json and three tables for programs. Without --test
-the last third of the log is used for testing only.
+and by sparse identification - and judge all three on data that none of them was fitted to, as
+Section IV of the paper does: parameters, mean squared errors in special segments, paired t
+tests. DIR gets report.html for people, comparison.json and three tables for programs. Without
+--test the last third of the log is used for testing only.
 
 example:
   valveflow compare plant.mcap -o result --test other_days.mcap

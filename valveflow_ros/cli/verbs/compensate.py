@@ -66,8 +66,8 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         '--max-gain', metavar='G',
         type=number('units of u per MW', 0, 1e9, '--max-gain 50', above=True),
-        help='units of u per MW beyond which the table is of no use (default: 5 times the '
-        'least of the curve)',
+        help='units of u per MW above which the table is marked as not useful (default: 5 '
+        'times the least of the curve)',
     )  # fmt: skip
     parser.add_argument(
         '--tolerance', metavar='MW', default=0.01,

@@ -12,9 +12,10 @@ from valveflow_ros.errors import InputError, ParameterError, UsageError, counted
 
 _DESCRIPTION = """\
 init LOG reads a log of the plant and writes a parameter file for the monitor: every parameter
-with its meaning, unit and range; those that the data tell (the step, the units, the noise, time
-constants) are fitted and say from what, the rest has its default. check FILE reads a parameter
-file as the monitor would and names what is wrong with it, or what differs from the defaults.
+with its meaning, unit and range; those that the data show (the step, the units, the noise, time
+constants) are set from the data, with the reason; the others have their default. check FILE
+reads a parameter file as the monitor would and names what is wrong with it, or what differs from
+the defaults.
 
 example:
   valveflow config init plant.mcap -o monitor.yaml

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Compare the simulation (flow characteristic and regional dynamics, run on the measured opening
 and pressure) with the measured power, name the physical cause of what differs, extend the model
-by it, and measure the gain on blocks of time that nothing was fitted to. DIR gets
-diagnosis.json, extended_model.json and report.html.
+by it, and measure on blocks of time that were not used for fitting how much the error falls. DIR
+gets diagnosis.json, extended_model.json and report.html.
 
 example:
   valveflow diagnose plant.mcap -o result
@@ -50,7 +50,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
         help='characteristic.json or extended_model.json of an earlier log, to compare with '
-        'this one; found anew without it',
+        'this one; without it the curve is found from this log',
     )  # fmt: skip
     add_covariate(parser)
     add_analysis_options(parser)

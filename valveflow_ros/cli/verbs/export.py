@@ -10,11 +10,12 @@ from pathlib import Path
 from valveflow_ros.cli.command import Console, VerbResult, add_mapping, mapping_of, rejected_words
 
 _DESCRIPTION = """\
-Write a log as a table with one row a sample: the rows the engine sees, in its units. Where a
-signal has no usable value the cell is empty.
+Write a log as a table with one row for each time: the rows that are used for fitting, in their
+units. Where a signal has no usable value the cell is empty.
 
-With --outputs what a monitor said in its recording instead, one table a kind: curves,
-predictions, alarms, diagnoses and health become said_curves.csv, said_predictions.csv, ...
+With --outputs write instead what a monitor published in its recording, one table for each kind:
+curves, predictions, alarms, diagnoses and health become said_curves.csv, said_predictions.csv,
+...
 
 example:
   valveflow export plant.mcap -o plant.csv
@@ -31,7 +32,8 @@ def arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         '--outputs', action='store_true',
-        help='what the monitor said: TABLE names the tables, which get a kind behind their name',
+        help='what the monitor published: TABLE names the tables, which get a kind behind '
+        'their name',
     )  # fmt: skip
     add_mapping(parser)
     parser.add_argument(

@@ -19,13 +19,13 @@ from valveflow_ros.cli.command import (
 _DESCRIPTION = """\
 Identify, diagnose and monitor many logs of many units, side by side on the cores of this machine
 or on a Dask cluster. The curve of a log is the reference of the next one of its unit. DIR gets
-fleet.html (which units lose power, since when and why), fleet.parquet (one row a log) and the
-reports of each log in units/UNIT/LOG. Run it again after a stop, or with further logs: what is
-done and unchanged is not done again.
+fleet.html (which units lose power, since when and why), fleet.parquet (one row for each log) and
+the reports of each log in units/UNIT/LOG. Run it again after a stop, or with further logs: a log
+that is done and unchanged is not done again.
 
 The unit of a log is the folder it stands in; its logs are taken in the order of their names. A
 manifest says otherwise: a CSV file with the columns unit, log and, if wanted, options, such as
---constant main_steam_temperature=540. The paths in it are seen from its folder.
+--constant main_steam_temperature=540. Paths in it are relative to its folder.
 
 example:
   valveflow fleet plants -o result        with plants/UNIT/2026-01.csv, 2026-02.csv, ...
@@ -61,7 +61,7 @@ def arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='one parameter, such as time_constant=120; stands above the file',
+        help='one parameter, such as time_constant=120; overrides the file',
     )  # fmt: skip
     add_mapping(parser)
 

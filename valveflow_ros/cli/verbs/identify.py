@@ -42,7 +42,7 @@ and for a table with names of your own:
       --column main_steam_pressure=PT_100:bar --column generated_power=MW_GROSS
       --constant main_steam_temperature=540
 
-with the causes that diagnose found in an earlier log held:
+without the effect of causes that diagnose found in an earlier log:
   valveflow identify plant.mcap -o result --model earlier/extended_model.json"""
 
 
@@ -53,8 +53,8 @@ def arguments(parser: ArgumentParser) -> None:
     add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
-        help='an extended_model.json of diagnose: its causes are held, curve and dynamics found '
-        'anew',
+        help='an extended_model.json of diagnose: its causes are kept fixed, curve and dynamics '
+        'are found anew',
     )  # fmt: skip
     parser.add_argument(
         '--reference', metavar='FILE', type=Path,

@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
 _DESCRIPTION = """\
-Read a table exported from a historian (CSV, Excel or Parquet; a column a signal, or a row a
-value) and write it as an MCAP recording that valveflow, ros2 bag, Foxglove and PlotJuggler
-read. Columns, units, dates and decimal marks are recognised, and what was understood is shown;
-what could be read in two ways is refused with the option to add. What was not logged can be
-given as a constant. --dry-run only shows what was understood.
+Read a table exported from a historian (CSV, Excel or Parquet; one column for each signal, or one
+row for each value) and write it as an MCAP recording that valveflow, ros2 bag, Foxglove and
+PlotJuggler read. It recognises columns, units, dates and decimal marks, and shows what it
+recognised. Where a table can be read in two ways, it stops and names the option to add. A signal
+that was not recorded can be given as a constant. --dry-run writes nothing.
 
 example:
   valveflow import history.csv --dry-run
 
-a period of the history of an OPC UA server, with the mapping of the gateway; one that was
-stopped goes on when the command is given again:
+a period from the history of an OPC UA server, with the mapping file of the gateway; after a stop
+the same command continues:
   valveflow import opcua://127.0.0.1:4840 --mapping opcua.yaml --from 2026-01-01
       --to 2026-02-01 -o january.mcap
 
-and with columns whose names say nothing:
+with column names that the program cannot recognise:
   valveflow import history.csv -o history.mcap --column valve_opening=CV_POS
       --column main_steam_pressure=PT_100:bar --column generated_power=MW_GROSS
       --constant main_steam_temperature=540 --time-zone Europe/Berlin"""
@@ -71,7 +71,7 @@ def arguments(parser: ArgumentParser) -> None:
         help='where to write: an .mcap file, or a folder as ros2 bag makes it',
     )  # fmt: skip
     parser.add_argument(
-        '--dry-run', action='store_true', help='show what was understood and write nothing'
+        '--dry-run', action='store_true', help='show what was recognised and write nothing'
     )
     add_mapping(parser)
     add_covariate(
@@ -85,9 +85,14 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     historian.add_argument('--unit', metavar='TAG', help='which unit of several in that file')
     historian.add_argument(
-        '--from', dest='begin', metavar='TIME', help='such as 2026-01-31 or 2026-01-31T06:00Z'
+        '--from',
+        dest='begin',
+        metavar='TIME',
+        help='begin of the period, such as 2026-01-31 or 2026-01-31T06:00Z',
     )
-    historian.add_argument('--to', dest='end', metavar='TIME', help='not included')
+    historian.add_argument(
+        '--to', dest='end', metavar='TIME', help='end of the period; not included'
+    )
 
 
 def run(options: Namespace, console: Console) -> VerbResult:

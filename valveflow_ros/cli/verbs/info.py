@@ -29,8 +29,9 @@ _GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 
 _OTHER_NS = 60 * 10**9  # beyond it, times of messages and of their values differ
 _DESCRIPTION = """\
-Look into a log before working with it: its span, topics and rates, the range of each signal,
-gaps, values that will be rejected and why, attachments, and whether anything is damaged.
+Show what a log contains before working with it: its time span, topics and rates, the range of
+each signal, gaps, values that will be rejected and why, attachments, and whether anything is
+damaged.
 
 example:
   valveflow info plant.mcap"""
@@ -40,7 +41,7 @@ def arguments(parser: ArgumentParser) -> None:
     """Add description, example and options."""
     parser.description = _DESCRIPTION
     parser.usage = 'valveflow info LOG [options]'
-    parser.add_argument('log', metavar='LOG', type=Path, help='the log to look into')
+    parser.add_argument('log', metavar='LOG', type=Path, help='the log to show')
     add_mapping(parser)
 
 

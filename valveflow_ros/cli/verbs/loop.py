@@ -21,12 +21,12 @@ from valveflow_ros.interface.files import check_folder
 _DESCRIPTION = """\
 Judge the valve of one control loop from the controller's output and the measured position, or
 from the controller's output and the process value alone: it sticks, it has slack, the loop
-oscillates for another reason, it is sound, or the record cannot tell. 200 rows are the least.
-DIR gets loop.json.
+oscillates for another reason, it is sound, or the record cannot tell. At least 200 rows are
+needed. DIR gets loop.json.
 
 example:
   valveflow loop FIC101.csv -o result
-and with columns whose names say nothing:
+with column names that the program cannot recognise:
   valveflow loop trend.csv -o result --command A17 --process A18"""
 
 
@@ -43,7 +43,7 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     for option, about in (
         ('command', "the controller's output in %% (by default a column named OP, MV, ...)"),
-        ('position', 'the measured position in %%; with it the sizes are told'),
+        ('position', 'the measured position in %%; with it the sizes of the faults are estimated'),
         ('process', 'the process value: flow, level, pressure (by default PV)'),
         ('set-point', 'the set point (by default SP or SV); it may be absent'),
         ('time', 'date and time, or Unix seconds'),

@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.monitor import MonitorResult
 
 _DESCRIPTION = """\
-Run the monitor over a recorded log as fast as it goes: its curves, alarms and diagnoses, as the
-node would have told them. The way to choose alarm parameters before a monitor goes live.
-DIR gets report.html for people and monitor.json for programs.
+Run the monitor over a recorded log, as fast as possible: the curves, alarms and diagnoses that
+the live monitor would have given. Use it to choose alarm parameters before the monitor runs
+live. DIR gets report.html for people and monitor.json for programs.
 
 example:
   valveflow monitor plant.mcap -o result
 
-and quicker, without the diagnoses:
+faster, without the diagnoses:
   valveflow monitor plant.mcap -o result --no-diagnosis --set alarm_floor=2.0
 
-and quickest, by a curve that is there already, without a fit:
+fastest, with a curve that exists already, without a fit:
   valveflow monitor plant.mcap -o result --reference health/characteristic.json \\
       --no-diagnosis --set refit_period=0 --set refit_segments=0 --set alarm_on_delay=600
 
@@ -52,11 +52,12 @@ def arguments(parser: ArgumentParser) -> None:
     add_analysis(parser)
     parser.add_argument(
         '--model', metavar='FILE', type=Path,
-        help='an extended_model.json of diagnose: its causes are taken out of the rows first',
+        help='an extended_model.json of diagnose: the effects of its causes are removed from the '
+        'rows first',
     )  # fmt: skip
     parser.add_argument(
         '--reference', metavar='FILE', type=Path,
-        help='a characteristic.json of the plant in health',
+        help='a characteristic.json of the healthy plant',
     )  # fmt: skip
     parser.add_argument(
         '--no-diagnosis', action='store_true',

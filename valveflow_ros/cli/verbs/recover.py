@@ -12,7 +12,7 @@ from valveflow_ros.cli.command import Console, VerbResult
 _DESCRIPTION = """\
 Repair a recording that a crash, a full disk or a bad sector has left: everything that is
 intact is copied and gets a new index, what is damaged is left out and counted. Nothing is
-repaired by guessing, and the broken file is not touched.
+guessed, and the broken file is not changed.
 
 example:
   valveflow recover broken.mcap -o whole.mcap"""

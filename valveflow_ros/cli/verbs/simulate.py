@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Simulate the unit of the paper's study: a 300 MW unit under load control, with sliding
-pressure, primary-frequency pulses and noise, written down once a second. Effects make it
-misbehave in a known way, to see whether that is found.
+pressure, pulses of the primary frequency control and noise, recorded once a second. An effect
+is a known fault of the unit, to see whether the program finds it.
 
---unit takes another one, of about 330 MW, with boiler, governor, AGC, reheater and condenser:
+--unit chooses another unit, of about 330 MW, with boiler, governor, AGC, reheater and condenser:
   choked            one group of valves; the pressure behind them never reduces the flow (choked
                     flow, p^m f(V)), sliding pressure. The effect of this name is the opposite
   sequence          three or four valves that open one after the other, sliding pressure
@@ -74,11 +74,11 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--effect', action='append', default=[], metavar='NAME[:KEY=VALUE,...]',
-        help='switch an effect on; may be given several times',
+        help='simulate this effect (a fault); may be given several times',
     )  # fmt: skip
     parser.add_argument(
         '--truth', metavar='FILE', type=Path,
-        help='also write what is true of the plant, as JSON; the log itself does not tell',
+        help='also write the true values of the plant, as JSON; the log does not contain them',
     )  # fmt: skip
     parser.add_argument('--effects', action='store_true', help='list the effects, then stop')
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')

@@ -24,7 +24,7 @@ _DAY = 86_400
 _TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx')
 
 _DESCRIPTION = """\
-Show how a monitor is doing, drawn anew once a second: the curve with today's operating point,
+Show the state of a monitor, updated every second: the curve with today's operating point,
 its age, the last residuals with their limits, alarms, inputs, recorder and diagnosis. With a
 LOG it follows the recording of a monitor while it grows, also into further files; without one
 it listens to a running monitor over ROS 2. Ctrl-C ends it.
@@ -36,8 +36,8 @@ and over ROS 2, in a shell that has it:
   valveflow watch
   valveflow watch --ask acknowledge_alarms
 
-Where the output is no terminal, each change is a line instead. With --page it is shown on a page
-in the browser instead, with metrics for Prometheus; that needs pip install dash
+If the output is no terminal, each change is written as a line. With --page it is shown on a page
+in the browser, with metrics for Prometheus; that needs pip install dash
 prometheus-client waitress."""
 
 
@@ -62,7 +62,7 @@ def arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--ask', metavar='SERVICE',
-        help='have the monitor do something: acknowledge_alarms, shelve_alarms, unshelve_alarms, '
+        help='call a service of the monitor: acknowledge_alarms, shelve_alarms, unshelve_alarms, '
         'set_reference, refit or diagnose; print its answer, then stop',
     )  # fmt: skip
     parser.add_argument(
