@@ -165,7 +165,7 @@ def test_without_the_column_a_drift_is_told(plant, without):
     line = np.polynomial.Polynomial.fit(frame['generated_power_mw'], frame[COLUMN], 3)
     apart = frame[COLUMN] - line(frame['generated_power_mw'])
     assert slow.drift_mw == pytest.approx(abs(truth(plant)) * apart.std(), rel=0.3)
-    told = f'The power varies slowly over days, by about {slow.drift_mw:.2g} MW (mean over the '
+    told = f'The power varies slowly over days, by about {slow.drift_mw:.2g} MW on average, '
     assert told in without.sentence
     if without.verdict == 'nothing':
         assert 'down to a slow disturbance and its noise' in without.sentence

@@ -98,11 +98,11 @@ class Disturbance:
         if self.drift_mw is not None:
             length = 'days' if hours >= _DAYS_FROM_H else 'hours'
             return (
-                f'The power varies slowly over {length}, by about {self.drift_mw:.2g} MW (mean '
-                'over the loads seen), for a reason that these signals do not show.'
+                f'The power varies slowly over {length}, by about {self.drift_mw:.2g} MW on '
+                'average, for a reason that these signals do not show.'
             )
         return (
-            f'The power varies slowly, by about {self.rms_mw:.2g} MW (mean over the loads seen) '
+            f'The power varies slowly, by about {self.rms_mw:.2g} MW on average '
             f'over {hours:.2g} h, for a reason that these signals do not show.'
         )
 

@@ -351,7 +351,7 @@ class Mismatch(Memory):
     def _hint(self, j: int, effect: float, place: Callable[[float], str]) -> str:
         """Return the meaning of a statistic in words; ``effect`` in MW."""
         size, side = f'{abs(effect):.2g} MW', 'more' if effect > 0.0 else 'less'
-        mean = '(mean over the loads seen)'
+        mean = 'on average'
         if j >= BIN:
             low, high = self._ends
             at = low + (high - low) * (j - BIN) / (BINS - 1)
