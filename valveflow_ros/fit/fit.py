@@ -49,7 +49,8 @@ Progress = Callable[[str], None]
 class _Formed:
     """A task whose ``contents.u`` is the argument of the curve, and the other parts of the form.
 
-    ``scale`` (n,) is p^e; without it the power is F(u). ``held``: e is kept fixed.
+    ``scale`` (n,) is p^e; without it the power is F(u). ``pressure`` (n,) is p in MPa.
+    ``held``: the exponent of the pressure is kept fixed.
     """
 
     task: FitTask
@@ -57,12 +58,14 @@ class _Formed:
     offset_mw: float = 0.0
     scale: FloatArray | None = None
     evidence: FormEvidence | None = None
+    pressure: FloatArray | None = None
     held: bool = False
 
     @property
-    def free_exponent(self) -> float | None:
-        """Return e if it is to be fitted with the curve, else None."""
-        return None if self.held or not self.form.scaled else self.form.exponent
+    def exponents(self) -> tuple[float | None, float | None]:
+        """Return the exponent if it may be fitted, and the one kept unless data exclude it."""
+        usual = None if self.form.scaled else self.task.settings.real('pressure_exponent')
+        return None if self.held else self.form.exponent, usual
 
     @property
     def contents(self) -> WindowContents:
@@ -102,9 +105,11 @@ def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
         The data determine no curve; the message says why and what would help.
     """
     begun = _begin(task, progress)
-    task = begun.formed.task
-    found = _refined(begun, progress) if task.settings.flag('refine') else _judged(begun)
-    found = with_support(found, task.contents, task.input_noise)
+    if task.settings.flag('refine'):
+        found, contents = _refined(task, begun, progress)
+    else:
+        found, contents = _judged(begun), begun.formed.contents
+    found = with_support(found, contents, begun.formed.task.input_noise)
     return found.measured_in(task.settings.output_unit)
 
 
@@ -139,8 +144,8 @@ def outline(
     progress('curve and dynamics together')
     try:
         formed = begun.formed
-        model, power = search(_samples(formed), *_refinement(begun), formed.free_exponent)
-        return model, replace(formed.form, exponent=power * formed.form.exponent)
+        model, moved = search(_samples(formed), *_refinement(begun), *formed.exponents)
+        return model, replace(formed.form, exponent=formed.form.exponent + moved)
     except np.linalg.LinAlgError as error:
         raise DataError(f'Curve and dynamics could not be found together: {error}.') from None
 
@@ -188,7 +193,7 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
 def _formed(task: FitTask) -> _Formed:
     """Choose the form, unless the task or a parameter gives it, and convert the rows to it."""
     contents, exponent = task.contents, task.settings.real('pressure_exponent')
-    paper = _Formed(task, StaticForm(INTEGRATED_INPUT, exponent))
+    paper = _Formed(task, StaticForm(INTEGRATED_INPUT, exponent), held=True)
     if not len(contents.opening_percent):
         return paper
     pressure = pressure_of(contents.u, contents.opening_percent, exponent)
@@ -203,7 +208,7 @@ def _formed(task: FitTask) -> _Formed:
         found = _found_in_all_rows(found, contents, pressure, period, exponent)
     u, scale = found.form.of_rows(contents.opening_percent, pressure)
     if found.form == paper.form:
-        return replace(paper, evidence=found.evidence)
+        return replace(paper, evidence=found.evidence, pressure=pressure, held=found.exponent_held)
     # The noise of u must be in the unit of the axis.
     at = contents.special_rows()
     with np.errstate(invalid='ignore', divide='ignore'):
@@ -217,6 +222,7 @@ def _formed(task: FitTask) -> _Formed:
         found.offset_mw,
         scale,
         found.evidence,
+        pressure,
         found.exponent_held,
     )
 
@@ -357,6 +363,7 @@ def _samples(formed: _Formed) -> Samples:
     usable = (np.isfinite(c.u) & np.isfinite(c.power_mw)).astype(np.uint8)
     # A jump in time is a gap even without rows in it.
     usable[1:][np.diff(c.time_ns) > 1.5e9 * step] = 0
+    pressure = formed.pressure
     return Samples(
         u=np.where(usable > 0, c.u, 0.0),
         power_mw=np.where(usable > 0, c.power_mw, 0.0),
@@ -365,6 +372,7 @@ def _samples(formed: _Formed) -> Samples:
         settle_s=task.settings.settle_s,
         group=max(1, round(task.settings.real('block') / step)),
         scale=None if formed.scale is None else np.where(usable > 0, formed.scale, 1.0),
+        pressure_mpa=None if pressure is None else np.where(usable > 0, pressure, 1.0),
     )
 
 
@@ -377,12 +385,25 @@ def _refinement(begun: _Begun) -> tuple[RegionalModel, int | None]:
     return rich.model, task.settings.whole('max_pieces')
 
 
-def _refined(begun: _Begun, progress: Progress) -> Characteristic:
-    """Refine on all rows; if that is impossible return the partition's curve with a note."""
+def _refined(
+    task: FitTask, begun: _Begun, progress: Progress
+) -> tuple[Characteristic, WindowContents]:
+    """Refine on all rows; if that is impossible return the partition's curve with a note.
+
+    The rows that are returned have the u of the curve.
+    """
     progress('curve and dynamics together')
-    samples = _samples(begun.formed)
+    formed = begun.formed
+    samples = _samples(formed)
     try:
-        result = refine(samples, *_refinement(begun), begun.formed.free_exponent)
+        result = refine(samples, *_refinement(begun), *formed.exponents)
     except (np.linalg.LinAlgError, TooFewSamplesError) as error:
-        return _only_straight(begun, str(error))
-    return from_refined(begun.formed.task, begun.static, result, samples, begun.u_special)
+        return _only_straight(begun, str(error)), formed.contents
+    if result.exponent_moved and not formed.form.scaled:
+        # The exact partition of another u.
+        form = replace(formed.form, exponent=formed.form.exponent + result.exponent_moved)
+        begun = _begin(replace(task, form=form), progress)
+        begun = replace(begun, static=replace(begun.static, form=formed.evidence))
+        samples = _samples(begun.formed)
+    found = from_refined(begun.formed.task, begun.static, result, samples, begun.u_special)
+    return found, begun.formed.contents

@@ -46,6 +46,8 @@ class Samples:
         Rows averaged before scoring.
     scale : float64 (n,), optional
         p^e of P = p^e F(u) + c; without it P = F(u).
+    pressure_mpa : float64 (n,), optional
+        p, 1 where a row has no data; only needed to fit the exponent of the pressure.
     """
 
     u: FloatArray
@@ -55,6 +57,7 @@ class Samples:
     settle_s: float
     group: int
     scale: FloatArray | None = None
+    pressure_mpa: FloatArray | None = None
 
     @property
     def means(self) -> int:
@@ -66,10 +69,22 @@ class Samples:
         """Return p^e, or ones for a form without p^e."""
         return np.ones(len(self.u)) if self.scale is None else self.scale
 
-    def with_scale_power(self, power: float) -> Samples:
-        """Return the rows with p^e raised to a power."""
-        scale = None if self.scale is None or power == 1.0 else self.scale**power
-        return self if scale is None else replace(self, scale=scale)
+    def with_exponent(self, by: float) -> Samples:
+        """Return the rows with an exponent of the pressure that is larger by ``by``."""
+        if not by or self.pressure_mpa is None:
+            return self
+        factor = self.pressure_mpa**by
+        if self.scale is None:
+            return replace(self, u=self.u * factor)
+        return replace(self, scale=self.scale * factor)
+
+    def model_with_exponent(self, model: RegionalModel, by: float) -> RegionalModel:
+        """Return the model that is the same at the median pressure after `with_exponent`."""
+        assert self.pressure_mpa is not None
+        middle = float(np.median(self.pressure_mpa[self.usable > 0])) ** by
+        if self.scale is None:
+            return replace(model, knots=model.knots * middle)
+        return replace(model, left=model.left / middle, right=model.right / middle)
 
     def finer(self) -> Samples:
         """Return the same rows with little averaging, for the last fit of all parameters."""
@@ -98,6 +113,7 @@ class Samples:
             step_s=self.step_s * factor,
             group=2,
             scale=None if self.scale is None else mean(self.scale),
+            pressure_mpa=None if self.pressure_mpa is None else mean(self.pressure_mpa),
         )
 
 

@@ -228,7 +228,13 @@ def find_regions(problem: Problem, model: RegionalModel) -> tuple[RegionalModel,
 _LEAST_ROWS, _LEAST_S = 600, 3600.0
 # Memory of the AR model: the sum of white and slow noise needs many coefficients.
 _MEMORY_S = 40.0
-_POWER_STEP, _POWER_ROUNDS = 0.01, 4
+# Rounds of the search for the exponent of the pressure, its largest step, and the step in standard
+# errors that ends it.
+_EXPONENT_ROUNDS, _EXPONENT_MOST, _EXPONENT_NEAR = 5, 0.05, 0.2
+# An exponent is clearly better if it differs by this many standard errors; at the start of the
+# search they contain a misfit and are larger.
+_EXPONENT_Z, _EXPONENT_FIRST_Z = 4.0, 1.5
+_EXPONENT_FAR = 0.01
 _NARROWEST = 0.01  # of the range of u: narrower pieces are joined before the search
 
 
@@ -257,8 +263,9 @@ class Refined:
         sd of the residual of single rows.
     confidence : dict
         Probability of each number of pieces; empty when it was given.
-    scale_power : float
-        The power to which p^e was raised.
+    exponent_moved, exponent_stderr : float
+        Change of the exponent of the pressure from its start, and its standard error, NaN if it
+        was not free.
     """
 
     model: RegionalModel
@@ -272,12 +279,14 @@ class Refined:
     weight: ByteArray
     row_sd_mw: float
     confidence: dict[int, float] = field(default_factory=dict)
-    scale_power: float = 1.0
+    exponent_moved: float = 0.0
+    exponent_stderr: float = math.nan
 
 
 def refine(
     samples: Samples, start: RegionalModel, most_pieces: int | None = None,
     exponent: float | None = None,
+    usual: float | None = None,
 ) -> Refined:  # fmt: skip
     """Fit curve and dynamics together, from ``start``'s curve.
 
@@ -293,8 +302,9 @@ def refine(
         By default the number of ``start`` is kept, except that pieces narrower than a hundredth
         of the range are joined with others.
     exponent : float, optional
-        e of p^e if e is free: p^e is raised to the power that fits best,
-        `Refined.scale_power`.
+        Start of the exponent of the pressure if it is free.
+    usual : float, optional
+        An exponent that is kept if it is the start, unless another one is clearly better.
 
     Raises
     ------
@@ -305,8 +315,8 @@ def refine(
     -------
     Refined
     """
-    model, likely, power = _outlined(samples, start, most_pieces, exponent)
-    samples = samples.with_scale_power(power)
+    model, likely, moved, fitted = _outlined(samples, start, most_pieces, exponent, usual)
+    samples = samples.with_exponent(moved)
     problem = Problem(samples)
     searched = model.pieces
     fine = Problem(samples.finer())
@@ -326,8 +336,10 @@ def refine(
     if jumps.any():
         model, cost = move(fine, model, ar, free, 4)
     model = corrected(samples, fine, model, ar, free)
-    found = _conclude(problem, fine, model, free, ar)
-    return replace(found, confidence=shifted(likely, model.pieces - searched), scale_power=power)
+    found = _conclude(problem, fine, model, free, ar, fitted)
+    return replace(
+        found, confidence=shifted(likely, model.pieces - searched), exponent_moved=moved
+    )
 
 
 def search(
@@ -335,24 +347,29 @@ def search(
     start: RegionalModel,
     most_pieces: int | None,
     exponent: float | None = None,
+    usual: float | None = None,
 ) -> tuple[RegionalModel, float]:
     """Find regions and pieces on averaged rows: `refine` without its last fit.
 
-    Return the model, and the power of p^e that fits best.
+    Return the model, and the change of the exponent of the pressure.
 
     Raises
     ------
     TooFewSamplesError
         As in `refine`.
     """
-    model, _, power = _outlined(samples, start, most_pieces, exponent)
-    return model, power
+    model, _, moved, _ = _outlined(samples, start, most_pieces, exponent, usual)
+    return model, moved
 
 
 def _outlined(
-    samples: Samples, start: RegionalModel, most_pieces: int | None, exponent: float | None
-) -> tuple[RegionalModel, dict[int, float], float]:
-    """Search on coarse rows, if there are enough of them."""
+    samples: Samples,
+    start: RegionalModel,
+    most_pieces: int | None,
+    exponent: float | None,
+    usual: float | None,
+) -> tuple[RegionalModel, dict[int, float], float, bool]:
+    """Search on coarse rows, if there are enough of them; tell if the exponent was fitted."""
     _, weight = Problem(samples).answer(
         replace(start, levels=np.empty(0), time_constants=np.ones(1), delays=np.zeros(1))
     )
@@ -363,38 +380,42 @@ def _outlined(
         )
     coarse = samples.coarser()
     model, likely = _search(Problem(coarse), _join(start), most_pieces)
-    if exponent is None or samples.scale is None:
-        return model, likely, 1.0
-    return _with_exponent(coarse, model, likely, exponent)
+    if exponent is None or samples.pressure_mpa is None:
+        return model, likely, 0.0, False
+    found = _with_exponent(coarse, model, exponent, exponent == usual)
+    if found is None:
+        return model, likely, 0.0, False
+    model, moved = found
+    if samples.scale is None and abs(moved) > _EXPONENT_FAR:
+        # The pieces of a curve with another exponent may be others.
+        begin = coarse.model_with_exponent(_join(start), moved)
+        model, likely = _search(Problem(coarse.with_exponent(moved)), begin, most_pieces)
+    return model, likely, moved, True
 
 
 def _with_exponent(
-    coarse: Samples, model: RegionalModel, likely: dict[int, float], exponent: float
-) -> tuple[RegionalModel, dict[int, float], float]:
-    """Return a model with the power of p^e that fits best; all other parameters are refitted."""
-    free = free_parameters(model)
-    residual, weight = Problem(coarse).answer(model)
-    ar = fit_ar(residual, weight)
+    coarse: Samples, model: RegionalModel, exponent: float, kept: bool
+) -> tuple[RegionalModel, float] | None:
+    """Return a model with the exponent that fits best, and the change of the exponent.
 
-    def fitted(power: float) -> tuple[float, RegionalModel]:
-        problem = Problem(coarse.with_scale_power(power))
-        # The factor of F at the median pressure is kept constant.
-        middle = float(np.median(coarse.scale_or_ones[coarse.usable > 0])) ** (1.0 - power)
-        begin = replace(model, left=middle * model.left, right=middle * model.right)
-        moved, cost = move(problem, begin, ar, free, 3)
-        return cost, moved
-
-    power, step = 1.0, _POWER_STEP
-    for _ in range(_POWER_ROUNDS):
-        places = (power - step, power, power + step)
-        low, here, high = (fitted(p)[0] for p in places)
-        bend = low - 2.0 * here + high
-        by = 0.5 * step * (low - high) / bend if bend > 0.0 else math.copysign(step, low - high)
-        power += float(np.clip(by, -2.0 * step, 2.0 * step))
-        power = float(np.clip(power, EXPONENTS[0] / exponent, EXPONENTS[1] / exponent))
-        if abs(by) < step:
+    None if the exponent is to be ``kept`` unless another one is clearly better, and none is.
+    """
+    free, by, error = free_parameters(model), 0.0, math.nan
+    low, high = EXPONENTS[0] - exponent, EXPONENTS[1] - exponent
+    for _ in range(_EXPONENT_ROUNDS):
+        problem = Problem(coarse.with_exponent(by))
+        ar = fit_ar(*problem.answer(model))
+        found = covariance_of(problem, model, free, ar, final=False, exponent=True)
+        step, error = found.exponent_step, found.exponent_stderr
+        if not math.isfinite(step) or abs(step) < _EXPONENT_NEAR * error:
             break
-    return fitted(power)[1], likely, power
+        if kept and not by and abs(step) < _EXPONENT_FIRST_Z * error:
+            return None
+        trial = float(np.clip(by + np.clip(step, -_EXPONENT_MOST, _EXPONENT_MOST), low, high))
+        model = coarse.model_with_exponent(model, trial - by)
+        model, _ = move(Problem(coarse.with_exponent(trial)), model, ar, free, 3)
+        by = trial
+    return None if kept and not abs(by) > _EXPONENT_Z * error else (model, by)
 
 
 def least_rows(step_s: float) -> int:
@@ -434,14 +455,16 @@ def _join(model: RegionalModel) -> RegionalModel:
 
 
 def _conclude(
-    problem: Problem, fine: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray
-) -> Refined:
+    problem: Problem, fine: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray,
+    exponent: bool,
+) -> Refined:  # fmt: skip
     """Add the residual and the uncertainty of the parameters."""
-    certainty = covariance_of(fine, model, free, ar)
+    certainty = covariance_of(fine, model, free, ar, exponent=exponent)
     residual, weight = problem.answer(model)
     return Refined(
         model, certainty.covariance, certainty.level_stderr, free, ar, certainty.innovation_mw,
         certainty.prediction_mw, residual, weight, _row_sd(fine, model),
+        exponent_stderr=certainty.exponent_stderr,
     )  # fmt: skip
 
 

@@ -28,6 +28,7 @@ from valveflow_ros.fit.task import FitTask
 from valveflow_ros.numerics import running_average
 from valveflow_ros.records import COARSE_STEP_S, NS_PER_S, ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
+from valveflow_ros.signals.static_form import OPENING
 
 _Z95 = 1.959963984540054
 _MAD_TO_SD = 1.4826022185056018
@@ -143,7 +144,9 @@ def from_refined(
         breakpoint_intervals=intervals,
         dynamics=dynamics,
         offset_mw=m.offset,
-        pressure_scale_exponent=result.scale_power * static.pressure_scale_exponent,
+        notes=(*static.notes, *_form_errors(static, result)),
+        pressure_scale_exponent=static.pressure_scale_exponent
+        + (result.exponent_moved if static.axis == OPENING else 0.0),
         residuals=residual_statistics(
             task,
             result.residual_mw,
@@ -152,6 +155,22 @@ def from_refined(
             result.row_sd_mw,
             result.prediction_mw,
         ),
+    )
+
+
+def _form_errors(static: Characteristic, result: Refined) -> tuple[str, ...]:
+    """Return a note with the fitted exponent and c, and their 95 % intervals; none if given."""
+    if math.isnan(result.exponent_stderr):
+        return ()
+    said = 'The exponent m of the pressure was fitted: '
+    m = static.static_form.exponent
+    if static.axis != OPENING:
+        return (f'{said}{m:.3f} ± {_Z95 * result.exponent_stderr:.3f}.',)
+    error = _Z95 * math.sqrt(max(float(result.covariance[-1, -1]), 0.0))
+    m += result.exponent_moved
+    return (
+        f'{said}{m:.3f} ± {_Z95 * result.exponent_stderr:.3f}; '
+        f'the power without flow is c = {result.model.offset:.1f} ± {error:.1f} MW.',
     )
 
 

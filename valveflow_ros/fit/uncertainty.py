@@ -24,6 +24,7 @@ _SINGULAR = 1e-12
 _LEAST_IN_BLOCK_S = 500.0
 # The answer is not smooth in a level: a central difference over this step averages it.
 _LEVEL_STEP_MW = 2.0
+_EXPONENT_STEP = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +43,17 @@ class Certainty:
     prediction_mw : float
         Error of the prediction due to the errors of the parameters: root mean square of all rows.
         NaN if the fit is not the final one.
+    exponent_step, exponent_stderr : float
+        Change of the exponent of the pressure by one Gauss-Newton step of all parameters, and its
+        standard error; NaN if the exponent is not free.
     """
 
     covariance: FloatArray
     level_stderr: FloatArray
     innovation_mw: float
     prediction_mw: float
+    exponent_step: float = math.nan
+    exponent_stderr: float = math.nan
 
 
 def covariance_of(
@@ -56,18 +62,22 @@ def covariance_of(
     free: BoolArray,
     ar: FloatArray,
     final: bool = True,
+    exponent: bool = False,
 ) -> Certainty:
     """Return the covariance of the packed parameters, and in the ``final`` fit of the levels.
 
     The inverse normal matrix is widened if sums of scores over blocks vary more than with
-    independent innovations. In the final fit long blocks count too, and the levels are
-    parameters with derivatives by differences: time constants and delays depend on them.
+    independent innovations. In the final fit, and for an ``exponent`` of the pressure that is
+    free, long blocks count too. Levels and exponent are parameters with derivatives by
+    differences. The exponent changes the curve at no pressure but the others than the median one:
+    the errors of slopes are those at the median pressure.
     """
     packed, levels = len(free), len(model.levels) if final else 0
-    residual, jacobian, weight = problem.tangents(model, also=levels)
-    if levels:
-        _level_tangents(problem, model, jacobian[:, packed:])
-        free = np.append(free, np.ones(levels, dtype=bool))
+    residual, jacobian, weight = problem.tangents(model, also=levels + exponent)
+    _level_tangents(problem, model, jacobian[:, packed : packed + levels])
+    if exponent:
+        _exponent_tangent(problem, model, jacobian[:, packed + levels])
+    free = np.append(free, np.ones(levels + exponent, dtype=bool))
     sums, scores, rows = normal_equations(jacobian, residual, weight, ar, _blocks(problem))
     moved = free & (np.diag(sums)[:-1] > 0.0)
     used = np.flatnonzero(np.append(moved, True))
@@ -77,7 +87,7 @@ def covariance_of(
     inverse = inverse / np.outer(scale, scale)
     variance = float(sums[-1, -1]) / max(rows - len(inverse), 1)
     robust = np.diag(inverse @ gram(scores) @ inverse)
-    if final:
+    if final or exponent:
         long = np.array([part.sum(axis=0) for part in np.array_split(scores, _LONG_BLOCKS)])
         long_robust = np.diag(inverse @ gram(long) @ inverse)
         robust = np.maximum(robust, long_robust * (_LONG_BLOCKS / (_LONG_BLOCKS - 1)))
@@ -90,11 +100,14 @@ def covariance_of(
     dead = np.flatnonzero(free & ~moved)
     covariance[dead, dead] = np.nan
     known = np.where(np.outer(moved, moved), covariance, 0.0)
+    errors = np.sqrt(np.diag(covariance))
     return Certainty(
         covariance[:packed, :packed],
-        np.sqrt(np.diag(covariance)[packed:]),
+        errors[packed : packed + levels],
         float(np.sqrt(max(variance, 0.0))),
         _prediction_error(jacobian, weight, known) if final else math.nan,
+        float(inverse[-1] @ sums[:-1, -1]) if exponent and moved[-1] else math.nan,
+        float(errors[-1]) if exponent else math.nan,
     )
 
 
@@ -111,10 +124,20 @@ def _blocks(problem: Problem) -> int:
     return max(1, min(_MOST_BLOCKS, problem.samples.means // rows))
 
 
+def _exponent_tangent(problem: Problem, model: RegionalModel, column: FloatArray) -> None:
+    """Write the answer's change per unit of the exponent of the pressure, shape (m,)."""
+    s = problem.samples
+    high, low = (
+        Problem(s.with_exponent(by)).answer(s.model_with_exponent(model, by))[0]
+        for by in (0.5 * _EXPONENT_STEP, -0.5 * _EXPONENT_STEP)
+    )
+    column[:] = (low - high) / _EXPONENT_STEP
+
+
 def _level_tangents(problem: Problem, model: RegionalModel, columns: FloatArray) -> None:
     """Write the answer's change per MW of each level, shape (m, I - 1)."""
     step_mw = _LEVEL_STEP_MW * problem.size
-    for k in range(len(model.levels)):
+    for k in range(columns.shape[1]):
         half = np.zeros(len(model.levels))
         half[k] = 0.5 * step_mw
         low, _ = problem.answer(model.with_levels(model.levels - half))
