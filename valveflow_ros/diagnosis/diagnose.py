@@ -102,7 +102,9 @@ def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
 # Causes found without the model of the unit: in the actuator and in the record.
 
 _BETWEEN = 'Between the commanded and the measured opening: '
-_SLACK = 'The valve follows only after a slack of {w_percent:.2g} % of opening is taken up.'
+_SLACK = (
+    'After each reversal the valve moves only when the command has moved by {w_percent:.2g} %.'
+)
 
 
 def actuator_cause(found: SearchResult) -> tuple[NamedCause, ...]:
@@ -770,14 +772,14 @@ def _sentence(d: Diagnosis) -> str:
     if d.verdict == NOTHING:
         slow = '' if d.disturbance is None else 'a slow disturbance and '
         return (
-            f'Of the {len(catalogue()) - len(blind)} causes that could be judged none was found: '
-            f'the model explains the unit down to {slow}its noise.{but}{wander}'
+            f'No cause was found; {len(catalogue()) - len(blind)} were checked. The remaining '
+            f'difference between model and measurement is {slow}noise.{but}{wander}'
         )
-    near = f'; nearest: {", ".join(d.not_told_apart)}' if d.not_told_apart else ''
+    near = f' Most similar: {", ".join(d.not_told_apart)}.' if d.not_told_apart else ''
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     if d.unexplained_by == (_THE_TIME,):
         return f'{wander.strip()}{but}{besides}'
     return (
-        'Something is wrong that no cause of the catalogue explains; it depends on '
-        f'{" and ".join(d.unexplained_by)}{near}.{but}' + wander + besides
+        'No cause of the catalogue explains the difference between model and measurement. It '
+        f'depends on {" and ".join(d.unexplained_by)}.{near}{but}' + wander + besides
     )

@@ -152,7 +152,7 @@ class Evidence:
         told = []
         if not self.gain > LEAST_GAIN:
             told.append(
-                'it explains held-out data too little better '
+                'it improves the prediction of held-out data too little '
                 f'({self.gain:+.1f} in log-likelihood, {LEAST_GAIN:.0f} needed)'
             )
         if not self.wald > self.least_wald:

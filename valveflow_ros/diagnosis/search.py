@@ -477,7 +477,7 @@ def _absorb(found: SearchResult, rival: Rival) -> None:
     name = rival.added.name
     found.evidence.pop(name, None)
     found.near.pop(name, None)
-    found.reasons[name] = 'it became a part of the plain model, which was free to have it'
+    found.reasons[name] = 'it is already included in the fitted curve and dynamics'
     whole = replace(rival.model.without(name), base=rival.model.regional)
     found.task, found.model, _ = settle(found.task, whole, rounds=1, steps=3)
     plain = replace(found.plain, base=rival.added.cause.act(found.plain.base, rival.added.values))
@@ -570,5 +570,7 @@ def _drop_weak(found: SearchResult, barred: set[str]) -> None:
             found.model = replace(smaller)
             found.evidence.pop(a.name, None)
             found.near.pop(a.name, None)
-            found.reasons[a.name] = f'the causes found later leave it only {loss:.1f} to explain'
+            found.reasons[a.name] = (
+                f'after the causes found later it gains only {loss:.1f} in log-likelihood'
+            )
             barred.add(a.name)

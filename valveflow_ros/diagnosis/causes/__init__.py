@@ -19,14 +19,14 @@ from valveflow_ros.errors import InputError
 TO_DO = {
     'backlash': (
         'Have the coupling between stem and plug, the lever and the feedback linkage looked at '
-        'in the next stop; measure the play by hand. Until then the controller hunts round '
-        'every set point by the width of the slack: keep its dead band above it. With '
-        '`model_file` the monitor takes the slack out and goes on judging the curve.'
+        'in the next stop; measure the play by hand. Until then the position oscillates by the '
+        'width of the backlash: set the dead band of the controller larger. With `model_file` '
+        'the monitor corrects for the backlash and continues to check the curve.'
     ),
     'choked': (
         'First ask whether the extraction or the first stage behind the valve is fouled: a '
-        'pressure there that rose over the years gives the same picture. If the geometry '
-        'explains it, nothing is broken: use the extended model, or log the pressure behind the '
+        'higher pressure there has the same effect. If the design of the valve explains it, '
+        'nothing is broken: use the extended model, or log the pressure behind the '
         'valve and compare it with `kappa`.'
     ),
     'clock': (
@@ -107,9 +107,8 @@ TO_DO = {
     ),
     'intervals': (
         'Log the state of extractions, heaters and auxiliary steam beside the power: it usually '
-        'falls on the same hours. Nothing is broken if it is meant; the monitor should be told, '
-        'or the alarm shelved while it lasts. A valve that should be shut and is not shows here '
-        'too.'
+        'falls on the same hours. If it is intended, nothing is broken: shelve the alarm while '
+        'it lasts. A valve that should be shut and is open has the same effect.'
     ),
     'offset_change': (
         'Check the zero of the power transducer, and whether auxiliary load or an extraction is '
@@ -151,13 +150,13 @@ TO_DO = {
     ),
     'stiction': (
         'Lubricate, retighten or renew the packing; check the positioner and the oil. Do not '
-        'tune the controller round it: a faster integral makes it hunt. With `valve_command` '
-        'published the monitor also sees friction in front of the position sensor.'
+        'make the integral action of the controller faster: the position would oscillate. With '
+        '`valve_command` published the monitor also detects friction before the position sensor.'
     ),
     'temperature': (
         'Hold the temperature better: sprays, burners, the boiler master. If it has to move, '
-        'use the extended model. The paper assumes it unchanged, and beyond '
-        '`temperature_spread_limit` the curve itself says that it is to be doubted.'
+        'use the extended model. The method assumes a constant temperature; if it varies by '
+        'more than `temperature_spread_limit`, the curve has a warning.'
     ),
 }
 

@@ -108,8 +108,8 @@ GAIN_DRIFT = Cause(
     (Unknown('g', '1/(10 d)', 5e-4, -0.5, 0.5),),
     apply_gain_drift, gain_drift_starts, gain_drift_sentence,
     ('input_drift', 'output_offset_drift', 'gain_step'),
-    'An hour on the flat end of the curve and an hour at low load: a drift of the input '
-    'vanishes on the flat end, one of the offset is the same at both.',
+    'Hold the load for an hour where the curve is flat and for an hour at low load: a drift of '
+    'the input has no effect where the curve is flat, one of the offset is equal at both.',
     a_day, slow=True,
 )  # fmt: skip
 
@@ -143,8 +143,9 @@ GAIN_STEP = Cause(
     (Unknown('g', '', 5e-4, -0.5, 0.5), ONSET),
     apply_gain_step, gain_step_starts, gain_step_sentence,
     ('input_step', 'curve_step', 'intervals', 'gain_drift'),
-    'An hour on the flat end of the curve and an hour at low load: a step of the input '
-    'vanishes on the flat end. Intervals end by themselves: wait some days.',
+    'Hold the load for an hour where the curve is flat and for an hour at low load: a step of '
+    'the input has no effect where the curve is flat. Intervals end by themselves: wait some '
+    'days.',
     a_day, slow=True,
 )  # fmt: skip
 
@@ -182,8 +183,8 @@ INPUT_DRIFT = Cause(
     (Unknown('g', '1/(10 d)', 5e-4, -0.5, 0.5),),
     apply_input_drift, input_drift_starts, input_drift_sentence,
     ('gain_drift', 'output_offset_drift', 'input_step'),
-    'An hour on the flat end of the curve and an hour at low load: a drift of the input '
-    'vanishes on the flat end.',
+    'Hold the load for an hour where the curve is flat and for an hour at low load: a drift of '
+    'the input has no effect where the curve is flat.',
     a_day, slow=True,
 )  # fmt: skip
 
@@ -218,8 +219,8 @@ INPUT_STEP = Cause(
     (Unknown('g', '', 5e-4, -0.5, 0.5), ONSET),
     apply_input_step, input_step_starts, input_step_sentence,
     ('gain_step', 'curve_step', 'input_drift'),
-    'An hour on the flat end of the curve and an hour at low load: a step of the input '
-    'vanishes on the flat end.',
+    'Hold the load for an hour where the curve is flat and for an hour at low load: a step of '
+    'the input has no effect where the curve is flat.',
     a_day, slow=True,
 )  # fmt: skip
 

@@ -49,7 +49,8 @@ BACKLASH = Cause(
     'backlash', 'slack', Stage.OPENING,
     (Unknown('w_percent', '%', 0.03, 0.0, 20.0, Kind.ROUGH),),
     apply_backlash, backlash_starts, backlash_sentence, ('stiction', 'region_lag', 'reheater'),
-    'Run the same ramp at two speeds: the loop of a slack keeps its width, that of a lag grows.',
+    'Run the same ramp at two speeds: with backlash the difference between up and down is the '
+    'same, with a lag it is larger at the higher speed.',
     order=3,
 )  # fmt: skip
 
@@ -187,7 +188,7 @@ RATE_LIMIT = Cause(
     'rate_limit', 'lag', Stage.OPENING,
     (Unknown('r_percent_per_s', '%/s', 0.005, 0.005, 100.0, Kind.ROUGH),),
     apply_rate_limit, rate_limit_starts, rate_limit_sentence, ('reheater', 'region_lag'),
-    'Steps of 1 % and of 4 %: with a bounded speed the large one takes four times as long.',
+    'Make steps of 1 % and of 4 %: with a limited speed the large one takes four times as long.',
     order=0,
 )  # fmt: skip
 
@@ -221,6 +222,7 @@ SATURATION = Cause(
     (Unknown('max_percent', '%', 0.1, 1.0, 150.0, Kind.ROUGH),),
     apply_saturation, saturation_starts, saturation_sentence,
     ('curve_shape', 'exponent', 'choked'),
-    'Hold the opening high and change the pressure: a stop shows in the opening, not in u.',
+    'Hold the opening high and change the pressure: at a stop the power still follows the '
+    'pressure, but not the opening.',
     order=2,
 )  # fmt: skip

@@ -34,7 +34,7 @@ LEAST_ANSWER = 3.0
 LEAST_PERIODS = 3.0
 _DOUBT = (
     'A process that changes unmeasured, such as a varying supply pressure, can look the same: '
-    'with the controller in manual, steps of the command in both directions tell.'
+    'to decide, put the controller in manual and make steps in both directions.'
 )
 _MOST_ROWS = 20_000
 _WINDOW_ROWS = 1000  # the thresholds were determined on windows of 751 rows
@@ -255,10 +255,10 @@ def _of_fault(fault: actuator.ActuatorFault | None, rows: int) -> LoopJudgement:
         'stiction': f'The valve sticks and slips: it moves only after the command has gone '
         f'{first:.2g} % further.',
         'backlash': f'The valve moves with slack: {first:.2g} % when the command turns round.',
-        'rate_limit': f'The valve moves by at most {first:.2g} %/s and was waited for much of the '
-        'time; whether it sticks cannot be told.',
+        'rate_limit': f'The valve moves by at most {first:.2g} %/s, and for much of the time it '
+        'was behind its command; whether it sticks cannot be judged.',
         'saturation': f'The valve does not open beyond {first:.3g} %, where the command often '
-        'was; whether it sticks cannot be told.',
+        'was; whether it sticks cannot be judged.',
     }[fault.name]
     named = fault.name in VERDICTS
     return LoopJudgement(
@@ -321,14 +321,14 @@ def _hindered(c: FloatArray, y: FloatArray, what: str) -> str:
         return f'The command hardly moves: it has {len(np.unique(c))} different values.'
     if len(np.unique(y)) < _LEAST_LEVELS:
         return (
-            f'The {what} stands still while the command moves: it has {len(np.unique(y))} '
+            f'The {what} does not move while the command moves: it has {len(np.unique(y))} '
             'different values, so its sensor may be dead.'
         )
     flat = int(np.diff(np.flatnonzero(np.concatenate(([1], np.diff(y), [1])))).max())
     if flat > _MOST_FLAT * len(y) and what != 'position':
         return (
-            f'The {what} stands at one value for {flat} rows on end while the command moves, so '
-            'its sensor may be dead.'
+            f'The {what} has the same value in {flat} consecutive rows while the command moves, '
+            'so its sensor may be dead.'
         )
     share = max(_at_stop(c, float(c.min())), _at_stop(c, float(c.max())))
     if share > _MOST_AT_STOP and what != 'position':
