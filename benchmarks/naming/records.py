@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 import valveflow_ros as vf
-from benchmarks.diagnosis_cases import EFFECTS, Setting, hidden, null, outside, slow
+from benchmarks.diagnosis_cases import EFFECTS, Setting, drawn, hidden, null, outside, slow
 from benchmarks.diagnosis_outside import OUTSIDE, SLOW, slowly
 from benchmarks.diagnosis_study import simulated
 from valveflow_ros.errors import RecordingError
@@ -71,8 +71,8 @@ def entries(first: int) -> list[Entry]:
     rng = np.random.default_rng([first, 1])
     for (plant, recording), names in HIDDEN.items():
         outer = (*OUTSIDE, *_SLOW) if (plant, recording) == ('paper', '1s') else _SLOW
-        drawn = rng.choice(np.array(outer), _OUTSIDE, replace=False).tolist()
-        rest = [('healthy', '')] * _HEALTHY + [('outside', label) for label in drawn]
+        labels = rng.choice(np.array(outer), _OUTSIDE, replace=False).tolist()
+        rest = [('healthy', '')] * _HEALTHY + [('outside', label) for label in labels]
         found += [(plant, recording, *what) for what in [('hidden', n) for n in names] + rest]
     ordered = [Entry(first + k, *what) for k, what in enumerate(found)]
     return [ordered[k] for k in rng.permutation(len(ordered))]
@@ -111,7 +111,7 @@ def _physics(entry: Entry, days: float) -> tuple[Simulation, tuple[EffectSpec, .
     effects: tuple[EffectSpec, ...] = ()
     if entry.kind == 'hidden':
         setting = Setting(rng, UnitDescription(), days, *TIMES)
-        effects = (EffectSpec.parse(EFFECTS[entry.label](setting)),)
+        effects = (drawn(entry.label, setting),)
     simulation = vf.simulate(days, entry.seed, effects, unit=f'{kind}:number={entry.seed}')
     if entry.kind == 'outside':
         data: Any = simulation.data
