@@ -85,31 +85,13 @@ def compared(seed: int, given: argparse.Namespace) -> dict[str, Any]:
 def judgement(r: Comparison) -> dict[str, Any]:
     """Return the numbers of one comparison."""
     kinds = {'all': None, 'steady': SegmentKind.STEADY, 'slope': SegmentKind.SLOPE}
-    j, hammerstein = r.judgement, r.hammerstein.model
-    sparse: dict[str, Any] = {'failure': r.failure}
-    if r.sparse is not None:
-        sparse = {
-            'form': r.sparse.form.kind, 'window_s': r.sparse.form.window_s,
-            'functions': list(r.sparse.model.terms), 'tried': r.sparse.mse_by_form,
-        }  # fmt: skip
+    j = r.judgement
     return {
         'finding': finding_of(r.pairs).value,
         'pieces': len(r.characteristic.pieces),
-        'hammerstein': {
-            'noise': r.hammerstein.noise, 'taps': len(hammerstein.b),
-            'poles': len(hammerstein.denominator),
-            'time_constants_s': hammerstein.time_constants_s.tolist(),
-        },
-        'sparse': sparse,
         'curve_errors': {m: asdict(e) for m, e in r.errors.items()},
-        'segments': {k: len(j.kinds(kind)) for k, kind in kinds.items()},
-        'samples_per_independent_value': j.widening,
         'mse_mw2': {n: {k: j.mse(n, kind) for k, kind in kinds.items()} for n in r.predictions},
         'all_rows_mse_mw2': dict(r.all_rows),
-        'zero_mean_stands': {
-            n: {'each_sample': j.passed(n, as_paper=True), 'counted': j.passed(n, as_paper=False)}
-            for n in r.predictions
-        },
         'pairs': [
             {
                 'terms': p.terms.value, 'against': p.baseline, 'ours': p.mse_ours_mw2,

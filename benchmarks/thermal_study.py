@@ -6,8 +6,7 @@ Run: ``python -m benchmarks.thermal_study --recording minute --seeds 100 --first
 is a unit of each kind of ``plant/thermal_unit.py``, drawn and run for some days. The error of a
 curve is the root mean square of its static power less the unit's at the mean weather of these
 days, over the openings and pressures visited.
-``--names`` runs a diagnosis of each healthy unit instead and counts what it names; ``--effect``
-hides an effect in each, as ``valveflow simulate --effect`` does. The limits in
+``--names`` runs a diagnosis of each healthy unit instead and counts what it names. The limits in
 ``fit/model_form.py`` were fixed on seeds 1 to 8, but for the least difference of two exponents:
 it, and the weather in the error, were set after a first look at seeds 101 to 200, and the choice
 of the form by all rows (``fit/fit.py``) after one at seeds 306, 401 to 410 and 501 to 530.
@@ -42,7 +41,7 @@ def row_of(unit: tuple[str, int], given: argparse.Namespace) -> dict[str, Any]:
     """Simulate a unit; return what is found of its curve, or what is named."""
     kind, seed = unit
     simulation = vf.simulate(
-        given.days, seed, given.effect, unit=f'{kind}:number={seed}', recording=given.recording
+        given.days, seed, unit=f'{kind}:number={seed}', recording=given.recording
     )
     log, begin = simulation.log, time.process_time()
     try:
@@ -134,12 +133,9 @@ def main() -> None:
     parser.add_argument('--recording', default='1s')
     parser.add_argument('--kinds', default=','.join(KINDS))
     parser.add_argument('--names', action='store_true')
-    parser.add_argument('--effect', action='append', default=[])
     given = parser.parse_args()
-    given.names = given.names or bool(given.effect)
-    hidden = [e.partition(':')[0] for e in given.effect]
-    what = '_'.join(['names' if given.names else 'curves', *hidden, given.recording])
-    name = study.name_of(f'thermal_{what}'.replace(':', '_').replace('=', '_'), given)
+    what = 'names' if given.names else 'curves'
+    name = study.name_of(f'thermal_{what}_{given.recording}', given)
     units = itertools.product(given.kinds.split(','), study.seeds(given))
     rows = study.rows_of(name, row_of, units, given)
     groups = study.by('kind', rows)
