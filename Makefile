@@ -10,9 +10,10 @@
 # make bench-gate  set-up, then this tree's speed against an earlier one's, by ratios (BASE=COMMIT; minutes)
 # make mutation   set-up, then small mistakes in recorder, recovery and state: which do the tests
 #                 notice? (hours; ONLY='valveflow_ros.state*' for some)
-# make repeat   set-up, then the quick tests of recorder, recovery and state, N=200 times
+# make repeat   set-up, then the quick tests of recorder, recovery and state, N=200 times, each time in
+#                 another order of the files, to find one that wavers
 # make torture   set-up, then kills, faults, flips, fuzz, signals and a year of soak, counted (hours)
-# make study   how good curve, choice, segments, shifts, alarm and baselines are (hours)
+# make study   how good curve, intervals, alarms, baselines and the judgement of loops are (hours)
 # make study-diagnosis   how often the diagnosis names the right cause, and none where there is none (hours)
 # make certify-partition   the exact partition of 305,633 samples against every break (minutes)
 # make docs    set-up, then the site: site/html, made by mkdocs in .venv-docs (Python 3.11 or later)
@@ -38,8 +39,7 @@ PYTHONS ?= python3.10 python3.12
 STRICT := $(wildcard $(addprefix valveflow_ros/,*.py signals segments partition curve fit \
   monitoring diagnosis baselines plant logs opcua report interface page cli) tools)
 BENCHMARKS := node_load partition reading ten_days
-STUDIES := paper_study coverage_study segment_study shift_study monitor_study \
-  compare_study study_figures refinery_valves
+STUDIES := paper_study coverage_study monitor_study compare_study refinery_valves
 
 help:
 	@sed -n 's/^# //p;/^$$/q' Makefile
@@ -84,19 +84,17 @@ mutation: setup
 	@$(ENV) mutmut run $(ONLY)
 
 repeat: setup
-	@$(ENV) python -m benchmarks.repeats --count $(or $(N),200)
+	@$(ENV) for k in $$(seq $(or $(N),200)); do python -m pytest -q -p no:cacheprovider \
+	  $$(shuf -e test/logs/test_*reco*.py test/ros/test_*state*.py test/test_state.py) || exit 1; done
 
 torture: setup
 	@$(ENV) python -m benchmarks.torture
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) python -m benchmarks.thermal_study --recording minute --seeds 100 --first 701 \
-	  --kinds choked,sequence,integrated_input
-	@$(ENV) python -m benchmarks.thermal_study --recording 1s --seeds 30 --first 701 \
-	  --kinds choked,sequence,integrated_input
-	@$(ENV) python -m benchmarks.thermal_study --recording compressed --seeds 30 --first 701 \
-	  --kinds choked,sequence,integrated_input
+	@$(ENV) for recording in '1s --seeds 30' 'compressed --seeds 30' 'minute --seeds 100'; do \
+	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input --first 701 \
+	  --recording $$recording || exit 1; done
 
 study-diagnosis: setup
 	@$(ENV) python -m benchmarks.diagnosis_study --kind null --seeds 150 --first 9000

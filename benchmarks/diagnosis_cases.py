@@ -23,15 +23,19 @@ class Case:
     label: str
     seed: int
     unit: UnitDescription
-    effects: tuple[EffectSpec, ...]
-    names: tuple[str, ...]
+    effects: tuple[EffectSpec, ...] = ()
     given: bool = False
     outside_share: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return what is to be named."""
+        return tuple(e.name for e in self.effects)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What an amplitude depends on."""
+    """What an amplitude depends on; each look at a drawn property draws anew."""
 
     rng: np.random.Generator
     unit: UnitDescription
@@ -39,41 +43,27 @@ class Setting:
     low: float = 2.0
     high: float = 4.0
 
-    def _relative(self, here: float, paper: float) -> float:
-        rated = self.unit.programme.load_high_mw
-        return here / paper * PAPER_RATED_MW / rated
-
-    @property
-    def noise(self) -> float:
-        """Return the long-run sd of this unit's noise relative to the paper's, per rated power.
-
-        What lasts is hidden by the spectrum of the noise at low frequencies.
-        """
-        n, p = self.unit.noise, UnitDescription().noise
-        return self._relative(
-            n.slow_mw * np.sqrt(n.slow_time_s), p.slow_mw * np.sqrt(p.slow_time_s)
-        )
-
-    @property
-    def quick_noise(self) -> float:
-        """Return the sd of this unit's noise relative to the paper's, per rated power."""
-        n = self.unit.noise
-        return self._relative(float(np.hypot(n.slow_mw, n.white_mw)), PAPER_NOISE_MW)
-
-    @property
-    def times(self) -> float:
-        """Draw a multiple of the smallest detectable amplitude."""
-        return float(np.exp(self.rng.uniform(np.log(self.low), np.log(self.high))))
+    def _times(self, here: float, paper: float) -> float:
+        """Draw a multiple of what is detectable, from this unit's noise and the paper's."""
+        relative = here / paper * PAPER_RATED_MW / self.unit.programme.load_high_mw
+        drawn = float(np.exp(self.rng.uniform(np.log(self.low), np.log(self.high))))
+        return drawn * relative * float(np.sqrt(10.0 / self.days))
 
     @property
     def size(self) -> float:
-        """Draw a multiple of what is detectable in ten days of the paper's unit, what lasts."""
-        return self.times * self.noise * float(np.sqrt(10.0 / self.days))
+        """Draw a multiple of what is detectable in ten days of the paper's unit, what lasts.
+
+        It is hidden by the spectrum of the noise at low frequencies.
+        """
+        n, p = self.unit.noise, UnitDescription().noise
+        here, paper = (float(x.slow_mw * np.sqrt(x.slow_time_s)) for x in (n, p))
+        return self._times(here, paper)
 
     @property
     def quick(self) -> float:
         """Draw a multiple of what is detectable in ten days of the paper's unit, what is fast."""
-        return self.times * self.quick_noise * float(np.sqrt(10.0 / self.days))
+        n = self.unit.noise
+        return self._times(float(np.hypot(n.slow_mw, n.white_mw)), PAPER_NOISE_MW)
 
     @property
     def sign(self) -> float:
@@ -97,93 +87,88 @@ class Setting:
         return float(low + margin + share * (high - low - 2.0 * margin))
 
 
-def _text(name: str, **values: float) -> str:
-    return f'{name}:' + ','.join(f'{k}={v:.6g}' for k, v in values.items())
+Values = dict[str, float]
 
 
-def _choked(s: Setting) -> str:
+def _choked(s: Setting) -> Values:
     plan = s.unit.programme
     pressure = float(plan.sliding_pressure_mpa(np.array([plan.load_high_mw]))[0])
-    ratio = s.rng.uniform(0.64, 0.72)
-    return _text('choked', kappa=ratio * pressure / plan.load_high_mw)
+    return {'kappa': s.rng.uniform(0.64, 0.72) * pressure / plan.load_high_mw}
 
 
-def _curve_step(s: Setting) -> str:
+def _curve_step(s: Setting) -> Values:
     first = s.rng.uniform(0.1, 0.5)
-    return _text(
-        'curve_step', s_mw=s.sign * 0.65 * s.size * s.mw, u_from=s.u(first),
-        u_to=s.u(first + s.rng.uniform(0.15, 0.3)), t0_days=s.onset,
-    )  # fmt: skip
+    return {
+        's_mw': s.sign * 0.65 * s.size * s.mw, 'u_from': s.u(first),
+        'u_to': s.u(first + s.rng.uniform(0.15, 0.3)), 't0_days': s.onset,
+    }  # fmt: skip
 
 
-def _curve_shape(s: Setting) -> str:
+def _curve_shape(s: Setting) -> Values:
     # In the middle of the longest piece: on a knee, the knee would take part of it.
     knots = s.unit.curve.knots
     k = int(np.argmax(np.diff(knots[: max(3, len(knots) - 1)])))
     width = s.rng.uniform(0.3, 0.5) * (knots[k + 1] - knots[k])
-    return _text(
-        'curve_shape', h_mw=s.sign * 0.6 * s.size * s.mw, u0=0.5 * (knots[k] + knots[k + 1]),
-        width_u=width,
-    )  # fmt: skip
+    height = s.sign * 0.6 * s.size * s.mw
+    return {'h_mw': height, 'u0': 0.5 * (knots[k] + knots[k + 1]), 'width_u': width}
 
 
-def _stiction(s: Setting) -> str:
+def _stiction(s: Setting) -> Values:
     band = s.quick  # 1 % is told from a mere slack
-    return _text('stiction', s_percent=band, j_percent=0.7 * band)
+    return {'s_percent': band, 'j_percent': 0.7 * band}
 
 
-def _clock(s: Setting) -> str:
-    least = min(r.delay_s for r in s.unit.regions)
-    return _text('clock', d_s=least + 10.0 * s.quick)
-
-
-def _reheater(s: Setting) -> str:
+def _reheater(s: Setting) -> Values:
     # What shows is the power that comes late, (1 - alpha) T.
     alpha = s.rng.uniform(0.25, 0.4)
-    return _text('reheater', alpha=alpha, time_s=14.0 * s.quick / (1.0 - alpha))
+    return {'alpha': alpha, 'time_s': 14.0 * s.quick / (1.0 - alpha)}
 
 
-def _region_lag(s: Setting) -> str:
+def _region_lag(s: Setting) -> Values:
     plan = s.unit.programme
     level = s.rng.uniform(0.35, 0.65) * (plan.load_high_mw - plan.load_low_mw) + plan.load_low_mw
     region = next(r for r in s.unit.regions if level < r.power_to_mw)
     factor = s.rng.uniform(2.0, 3.0) if s.rng.random() < 0.5 else s.rng.uniform(0.3, 0.5)
-    return _text(
-        'region_lag', time_s=region.time_constant_s * factor, delay_s=region.delay_s,
-        level_mw=level,
-    )  # fmt: skip
+    return {
+        'time_s': region.time_constant_s * factor, 'delay_s': region.delay_s, 'level_mw': level,
+    }  # fmt: skip
 
 
-def _intervals(s: Setting) -> str:
-    return (
-        _text('intervals', g=s.sign * 0.0018 * s.size, off_low_h=12.0, off_high_h=30.0)
-        + f',pattern={int(s.rng.integers(1, 10_000))}'
-    )
+def _intervals(s: Setting) -> Values:
+    size = s.sign * 0.0018 * s.size
+    return {
+        'g': size, 'off_low_h': 12.0, 'off_high_h': 30.0, 'pattern': int(s.rng.integers(1, 10_000))
+    }  # fmt: skip
 
 
-EFFECTS: dict[str, Callable[[Setting], str]] = {
-    'temperature': lambda s: _text('temperature', k=-0.00033 * s.size),
-    'exponent': lambda s: _text('exponent', dm=s.sign * 0.02 * s.size),
+EFFECTS: dict[str, Callable[[Setting], Values]] = {
+    'temperature': lambda s: {'k': -0.00033 * s.size},
+    'exponent': lambda s: {'dm': s.sign * 0.02 * s.size},
     'choked': _choked,
-    'gain_drift': lambda s: _text('gain_drift', g=s.sign * 0.0021 * s.size * 10.0 / s.days),
-    'input_drift': lambda s: _text('input_drift', g=s.sign * 0.0018 * s.size * 10.0 / s.days),
-    'output_offset_drift': lambda s: _text(
-        'output_offset_drift', b_mw=s.sign * 0.5 * s.size * s.mw * 10.0 / s.days
-    ),
-    'gain_step': lambda s: _text('gain_step', g=s.sign * 0.0014 * s.size, t0_days=s.onset),
-    'input_step': lambda s: _text('input_step', g=s.sign * 0.0014 * s.size, t0_days=s.onset),
+    'gain_drift': lambda s: {'g': s.sign * 0.0021 * s.size * 10.0 / s.days},
+    'input_drift': lambda s: {'g': s.sign * 0.0018 * s.size * 10.0 / s.days},
+    'output_offset_drift': lambda s: {'b_mw': s.sign * 0.5 * s.size * s.mw * 10.0 / s.days},
+    'gain_step': lambda s: {'g': s.sign * 0.0014 * s.size, 't0_days': s.onset},
+    'input_step': lambda s: {'g': s.sign * 0.0014 * s.size, 't0_days': s.onset},
     'curve_step': _curve_step,
     'intervals': _intervals,
-    'diurnal': lambda s: _text('diurnal', a=0.0009 * s.size, peak_h=s.rng.uniform(0.0, 24.0)),
-    'backlash': lambda s: _text('backlash', w_percent=0.09 * s.quick),
+    'diurnal': lambda s: {'a': 0.0009 * s.size, 'peak_h': s.rng.uniform(0.0, 24.0)},
+    'backlash': lambda s: {'w_percent': 0.09 * s.quick},
     'stiction': _stiction,
-    'rate_limit': lambda s: _text('rate_limit', r_percent_per_s=0.3 / s.quick),
-    'saturation': lambda s: _text('saturation', max_percent=s.rng.uniform(80.0, 85.0)),
+    'rate_limit': lambda s: {'r_percent_per_s': 0.3 / s.quick},
+    'saturation': lambda s: {'max_percent': s.rng.uniform(80.0, 85.0)},
     'region_lag': _region_lag,
     'reheater': _reheater,
-    'clock': _clock,
+    'clock': lambda s: {'d_s': min(r.delay_s for r in s.unit.regions) + 10.0 * s.quick},
     'curve_shape': _curve_shape,
 }
+
+
+def drawn(name: str, setting: Setting) -> EffectSpec:
+    """Draw the size of an effect, and what else is to be known of it."""
+    values = EFFECTS[name](setting)
+    return EffectSpec.parse(f'{name}:' + ','.join(f'{k}={v:.6g}' for k, v in values.items()))
+
 
 PAIRS = (
     ('backlash', 'gain_drift'), ('temperature', 'gain_step'), ('diurnal', 'backlash'),
@@ -202,13 +187,12 @@ def _unit(rng: np.random.Generator) -> UnitDescription:
 
 def hidden(names: tuple[str, ...], seed: int, days: float, times: tuple[float, float]) -> Case:
     """Return a plant with effects hidden in it."""
-    rng = np.random.default_rng([seed, *(ord(c) for c in '+'.join(names))])
+    label = '+'.join(names)
+    rng = np.random.default_rng([seed, *map(ord, label)])
     setting = Setting(rng, _unit(rng), days, *times)
-    effects = tuple(EffectSpec.parse(EFFECTS[name](setting)) for name in names)
-    return Case(
-        ('hidden', 'pair', 'triple')[len(names) - 1], '+'.join(names), seed, setting.unit, effects,
-        names, given='region_lag' in names,
-    )  # fmt: skip
+    effects = tuple(drawn(name, setting) for name in names)
+    kind = ('hidden', 'pair', 'triple')[len(names) - 1]
+    return Case(kind, label, seed, setting.unit, effects, given='region_lag' in names)
 
 
 CONFOUNDED = (
@@ -217,15 +201,16 @@ CONFOUNDED = (
 )  # fmt: skip
 
 
+def _t_follows_p(unit: UnitDescription) -> UnitDescription:
+    return replace(unit, programme=replace(unit.programme, temperature_pressure_correlation=0.8))
+
+
 def confounded(label: str, seed: int, days: float, times: tuple[float, float]) -> Case:
     """Return a plant whose effect is easily taken for another."""
-    name = label.partition(',')[0]
-    case = hidden((name,), seed, days, times)
-    if label.endswith('T follows p'):
-        plan = replace(case.unit.programme, temperature_pressure_correlation=0.8)
-        case = replace(case, unit=replace(case.unit, programme=plan))
+    case = hidden((label.partition(',')[0],), seed, days, times)
+    unit = _t_follows_p(case.unit) if label.endswith('T follows p') else case.unit
     given = case.given or label.endswith('earlier model')
-    return replace(case, kind='confounded', label=label, given=given)
+    return replace(case, kind='confounded', label=label, unit=unit, given=given)
 
 
 LEAST_SHARE, LARGEST_SHARE = 0.33, 0.6  # of the noise's sd: 11 to 36 % of its variance
@@ -235,13 +220,12 @@ def outside(label: str, seed: int) -> Case:
     """Return a plant with something in its record that no cause of the catalogue explains."""
     rng = np.random.default_rng([seed, len(label)])
     share = float(rng.uniform(LEAST_SHARE, LARGEST_SHARE))
-    return Case('outside', label, seed, _unit(rng), (), (), outside_share=share)
+    return Case('outside', label, seed, _unit(rng), outside_share=share)
 
 
 def slow(label: str, seed: int) -> Case:
     """Return a plant whose power changes slowly, in a shape that no one cause has."""
-    rng = np.random.default_rng([seed, len(label), 1])
-    return Case('slow', label, seed, _unit(rng), (), ())
+    return Case('slow', label, seed, _unit(np.random.default_rng([seed, len(label), 1])))
 
 
 def null(seed: int) -> Case:
@@ -250,15 +234,16 @@ def null(seed: int) -> Case:
     unit = _unit(rng)
     kind = ('clean', 'no feedback', 'load noise', 'ar 600 s', 'slow 2 h', 'T follows p')[seed % 6]
     noise, plan = unit.noise, unit.programme
-    scale = plan.load_high_mw / PAPER_RATED_MW
     if kind == 'no feedback':
-        plan = replace(plan, feedback=False)
+        unit = replace(unit, programme=replace(plan, feedback=False))
     elif kind == 'load noise':
-        noise = replace(noise, load_dependence=float(rng.uniform(-0.4, 0.6)))
+        drawn_share = float(rng.uniform(-0.4, 0.6))
+        unit = replace(unit, noise=replace(noise, load_dependence=drawn_share))
     elif kind == 'ar 600 s':
-        noise = replace(noise, slow_time_s=600.0)
+        unit = replace(unit, noise=replace(noise, slow_time_s=600.0))
     elif kind == 'slow 2 h':
-        noise = replace(noise, wander_mw=float(rng.uniform(0.6, 1.2)) * scale)
+        wander_mw = float(rng.uniform(0.6, 1.2)) * (plan.load_high_mw / PAPER_RATED_MW)
+        unit = replace(unit, noise=replace(noise, wander_mw=wander_mw))
     elif kind == 'T follows p':
-        plan = replace(plan, temperature_pressure_correlation=0.8)
-    return Case('null', kind, seed, replace(unit, noise=noise, programme=plan), (), ())
+        unit = _t_follows_p(unit)
+    return Case('null', kind, seed, unit)

@@ -21,6 +21,7 @@ cores two workers would be as much faster as ``times_on_free_cores`` says.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import os
@@ -41,16 +42,16 @@ import pandas as pd
 
 import valveflow_ros as vf
 from benchmarks import study
-from valveflow_ros.interface.fleets.fleet import Chain, spread
+from valveflow_ros.interface.fleets.fleet import Chain, FleetResult, spread
 from valveflow_ros.interface.fleets.unit_logs import UnitLog, read_options
 from valveflow_ros.interface.fleets.unit_month import FleetTask, Row
 
-_DAYS = {'paper': 0.25, 'choked': 1.0}
 _VERBS = ('read_s', 'identify_s', 'diagnose_s', 'monitor_s')
 # The monitor keeps the reference that it is given: a task of about a second.
 _WORDS = ['--no-diagnosis', '--set', 'refit_period=0', '--set', 'refit_segments=0']
 # A copy of a log stands elsewhere.
 _NOT_COMPARED = ('task_s', 'source', *_VERBS)
+_BROKEN = (b'', b'\x00\xff' * 500, b'time,valve_opening_percent\n2026,1\n', b'PK\x03\x04 no zip')
 
 
 def plants(folder: Path, units: int, months: int) -> list[Path]:
@@ -62,9 +63,8 @@ def plants(folder: Path, units: int, months: int) -> list[Path]:
         found.append(place)
         if place.exists():
             continue
-        days = _DAYS[kind]
-        more = {} if kind == 'paper' else {'unit': f'choked:number={number}',
-                                           'recording': 'minute'}  # fmt: skip
+        more = {'unit': f'choked:number={number}', 'recording': 'minute'}
+        days, more = (1.0, more) if number % 5 else (0.25, {})
         frame = vf.simulate(days * months, 7000 + number, **more).to_dataframe()
         place.mkdir(parents=True)
         month = (frame.time - frame.time.iloc[0]) // pd.Timedelta(days=days)
@@ -76,39 +76,37 @@ def plants(folder: Path, units: int, months: int) -> list[Path]:
 
 
 @contextmanager
-def cluster(workers: int) -> Iterator[Any]:
-    """Give a cluster of so many workers of one thread, as `fleet` makes it."""
-    from distributed import LocalCluster
+def cluster(workers: int) -> Iterator[tuple[Any, Any]]:
+    """Give a cluster of so many workers of one thread, as `fleet` makes it, and a client.
+
+    Every worker has loaded what tasks need.
+    """
+    from distributed import Client, LocalCluster
 
     with LocalCluster(
         n_workers=workers, threads_per_worker=1, processes=True, dashboard_address='127.0.0.1:0',
         silence_logs=50, env={'NUMBA_NUM_THREADS': '1'},
     ) as made:  # fmt: skip
         made.adapt(minimum=workers, maximum=workers, interval='1s')
-        yield made
+        with Client(made, set_as_default=False) as client:
+            client.run(lambda: __import__('valveflow_ros.interface.fleets.unit_month') and None)
+            yield made, client
 
 
-def warmed(made: Any) -> None:
-    """Let every worker load what tasks need."""
-    from distributed import Client
-
-    with Client(made, set_as_default=False) as client:
-        client.run(lambda: __import__('valveflow_ros.interface.fleets.unit_month') and None)
+def _rows(out: Path) -> list[Path]:
+    return list(out.glob('units/*/*/row.json'))
 
 
 def timed_fleet(logs: list[Path], out: Path, workers: int) -> dict[str, Any]:
     """Run a fleet; return its wall time and what the tasks took that it did, in s."""
-    from distributed import Client
-
-    kept = {p: p.stat().st_mtime_ns for p in out.glob('units/*/*/row.json')}
-    with cluster(workers) as made, Client(made, set_as_default=False) as client:
-        warmed(made)
+    kept = {p: p.stat().st_mtime_ns for p in _rows(out)}
+    with cluster(workers) as (made, client):
         cpu = sum(client.run(time.process_time).values())
         begun = time.perf_counter()
         found = vf.fleet(logs, out, scheduler=made.scheduler_address, options=_WORDS)
         wall = time.perf_counter() - begun
         cpu = sum(client.run(time.process_time).values()) - cpu
-    new = [p for p in out.glob('units/*/*/row.json') if kept.get(p) != p.stat().st_mtime_ns]
+    new = [p for p in _rows(out) if kept.get(p) != p.stat().st_mtime_ns]
     rows = [json.loads(p.read_text())['row'] for p in new]
     tasks = sum(row['task_s'] for row in rows)
     return {
@@ -120,86 +118,66 @@ def timed_fleet(logs: list[Path], out: Path, workers: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def digest(out: Path, unit: str, log: str) -> str:
-    """Return a hash of all files of a log but its times."""
-    found = hashlib.sha256()
-    place = out / 'units' / unit / log
-    for path in sorted(p for p in place.rglob('*') if p.is_file()):
-        data = path.read_bytes()
-        if path.name == 'row.json':
-            row = json.loads(data)['row']
-            data = json.dumps({k: v for k, v in row.items() if k not in _NOT_COMPARED}).encode()
-        found.update(f'{path.relative_to(place)} {len(data)}\n'.encode() + data)
-    return found.hexdigest()
-
-
-def digests(out: Path, skip: str = '') -> dict[str, str]:
-    """Return the hash of each log's files."""
-    return {
-        f'{unit.name}/{log.name}': digest(out, unit.name, log.name)
-        for unit in sorted((out / 'units').iterdir())
-        for log in sorted(p for p in unit.iterdir() if p.is_dir())
-        if not (skip and skip in log.name)
-    }
+def digests(out: Path) -> dict[str, str]:
+    """Return a hash of all files of each log but its times, of broken logs none."""
+    hashes = {}
+    for place in (p.parent for p in sorted(_rows(out)) if not p.parent.name.endswith('_broken')):
+        found = hashlib.sha256()
+        for path in sorted(p for p in place.rglob('*') if p.is_file()):
+            data = path.read_bytes()
+            if path.name == 'row.json':
+                row = json.loads(data)['row']
+                row = {k: v for k, v in row.items() if k not in _NOT_COMPARED}
+                data = json.dumps(row).encode()
+            found.update(f'{path.relative_to(place)} {len(data)}\n'.encode() + data)
+        hashes[f'{place.parent.name}/{place.name}'] = found.hexdigest()
+    return hashes
 
 
 def break_logs(folder: Path, logs: list[Path], count: int) -> list[Path]:
     """Copy the plants with broken logs among their months; return the folders."""
-    copied = []
-    for place in logs:
-        copy = folder / 'broken' / place.name
+    copied = [folder / 'broken' / place.name for place in logs]
+    for place, copy in zip(logs, copied, strict=True):
         shutil.copytree(place, copy, dirs_exist_ok=True)
-        copied.append(copy)
-    bad = [b'', b'\x00\xff' * 500, b'time,valve_opening_percent\n2026,1\n', b'PK\x03\x04 no zip']
     for k in range(count):
         place = copied[k % len(copied)]
         after = sorted(place.glob('*.csv'))[1 + k // len(copied)]
-        (place / f'{after.stem}_broken.csv').write_bytes(bad[k % len(bad)])
+        (place / f'{after.stem}_broken.csv').write_bytes(_BROKEN[k % len(_BROKEN)])
     return copied
 
 
 def disturbed(logs: list[Path], out: Path, kills: int, expected: int) -> dict[str, Any]:
     """Run the command while its workers are killed, kill it in the middle, run it again."""
-    from distributed import Client
-
     words = [sys.executable, '-m', 'valveflow_ros.cli', 'fleet', *map(str, logs), '-o', str(out),
              '--quiet', '--json', *_WORDS]  # fmt: skip
     done = threading.Event()
     killed: list[int] = []
 
-    def rows() -> int:
-        return len(list(out.glob('units/*/*/row.json')))
+    def executioner(client: Any) -> None:
+        # Spread over the whole run, whatever its speed.
+        while len(killed) < kills and not done.wait(0.3):
+            if len(_rows(out)) < (len(killed) + 1) * 0.9 * expected / kills:
+                continue
+            if pids := list(client.run(os.getpid, on_error='ignore').values()):
+                os.kill(pids[len(killed) % len(pids)], signal.SIGKILL)
+                killed.append(len(_rows(out)))
 
-    def executioner(address: str) -> None:
-        with Client(address, set_as_default=False) as client:
-            # Spread over the whole run, whatever its speed.
-            while len(killed) < kills and not done.wait(0.3):
-                if rows() < (len(killed) + 1) * 0.9 * expected / kills:
-                    continue
-                pids = list(client.run(os.getpid, on_error='ignore').values())
-                if pids:
-                    os.kill(pids[len(killed) % len(pids)], signal.SIGKILL)
-                    killed.append(rows())
-
-    with cluster(2) as made:
-        warmed(made)
+    with cluster(2) as (made, client):
         words += ['--scheduler', made.scheduler_address]
-        thread = threading.Thread(target=executioner, args=(made.scheduler_address,))
+        thread = threading.Thread(target=executioner, args=(client,))
         thread.start()
         begun = time.perf_counter()
         first = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        while rows() < expected // 2 and first.poll() is None:
+        while len(_rows(out)) < expected // 2 and first.poll() is None:
             time.sleep(0.2)
         first.kill()
         first.communicate()
-        stopped_at = rows()
-        second = subprocess.run(words, capture_output=True, text=True, check=False)
+        stopped_at = len(_rows(out))
+        second = subprocess.run(words, capture_output=True, text=True, check=True)
         wall = time.perf_counter() - begun
         done.set()
         thread.join()
-        again = subprocess.run(words, capture_output=True, text=True, check=False)
-    if second.returncode or again.returncode:
-        raise SystemExit(second.stderr + again.stderr)
+        again = subprocess.run(words, capture_output=True, text=True, check=True)
     return {
         'workers_killed': len(killed), 'command_killed_after_tasks': stopped_at,
         'wall_s': round(wall, 1), 'after_restart': json.loads(second.stdout)['tasks'],
@@ -212,32 +190,24 @@ def nothing(task: FleetTask) -> Row:
     return {'unit': task.of.unit, 'log': task.of.name}
 
 
-def _tiny_chain(unit: int, length: int, folder: Path) -> Chain:
-    how = read_options(_WORDS)
+def _tiny_chain(unit: int, length: int) -> Chain:
+    how, folder = read_options(_WORDS), Path('/nowhere')
     for k in range(length):
         log = UnitLog(f'U{unit:04d}', f'{k:03d}', folder / 'none.csv', how)
         yield FleetTask(log, folder, 'a reference', 'a first one')
 
 
 def scheduling(count: int, units: int) -> dict[str, Any]:
-    """Measure tasks that do nothing, in chains as those of a fleet."""
-    from distributed import Client
-
-    length = count // units
-    with cluster(2) as made, Client(made, set_as_default=False) as client:
-        warmed(made)
-        chains = [_tiny_chain(u, length, Path('/nowhere')) for u in range(units)]
-        before = resource.getrusage(resource.RUSAGE_SELF)
-        begun = time.perf_counter()
-        done = sum(1 for _ in spread(client, nothing, chains))
-        wall = time.perf_counter() - begun
-        after = resource.getrusage(resource.RUSAGE_SELF)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    with cluster(2) as (_, client):
+        chains = [_tiny_chain(u, count // units) for u in range(units)]
+        took, done = study.timed(lambda: sum(1 for _ in spread(client, nothing, chains)))
     return {
-        'tasks': done, 'units': units, 'wall_s': round(wall, 1),
-        'wall_ms_per_task': round(1000.0 * wall / done, 2),
-        'client_and_scheduler_cpu_ms_per_task': round(1000.0 * cpu / done, 2),
-        'client_and_scheduler_memory_mb': round(after.ru_maxrss / 1e3, 1),
+        'tasks': done, 'units': units, 'wall_s': round(took['wall_s'], 1),
+        'wall_ms_per_task': round(1000.0 * took['wall_s'] / done, 2),
+        'client_and_scheduler_cpu_ms_per_task': round(1000.0 * took['cpu_s'] / done, 2),
+        'client_and_scheduler_memory_mb': round(
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, 1
+        ),
         'load_average': round(os.getloadavg()[0], 1),
     }  # fmt: skip
 
@@ -246,8 +216,8 @@ def sizes(out: Path, logs: list[Path]) -> dict[str, float]:
     """Return the bytes of a task in MB."""
 
     def mean(pattern: str) -> float:
-        found = [p.stat().st_size for p in out.glob(pattern)]
-        return round(sum(found) / max(len(list(out.glob('units/*/*/row.json'))), 1) / 1e6, 4)
+        size = sum(p.stat().st_size for p in out.glob(pattern))
+        return round(size / max(len(_rows(out)), 1) / 1e6, 4)
 
     read = [p.stat().st_size for place in logs for p in place.glob('*.csv')]
     return {
@@ -257,52 +227,50 @@ def sizes(out: Path, logs: list[Path]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def part_scheduling(folder: Path, o: Any) -> dict[str, Any]:
+def part_scheduling(folder: Path, given: argparse.Namespace) -> dict[str, Any]:
     """Measure tasks that do nothing: ten and a hundred a unit."""
-    return {'runs': [scheduling(o.tiny, max(o.tiny // n, 1)) for n in (10, 100)]}
+    return {'runs': [scheduling(given.tiny, max(given.tiny // n, 1)) for n in (10, 100)]}
 
 
-def part_speed(folder: Path, o: Any) -> dict[str, Any]:
+def part_speed(folder: Path, given: argparse.Namespace) -> dict[str, Any]:
     """Run all units, four of them with one worker too."""
-    logs = plants(folder, o.units, o.months)
-    runs = []
-    early = [p for u in logs[:4] for p in sorted(u.glob('*.csv'))[: o.twice]]
-    for what, workers in ((early, 1), (early, 2), (logs, 2)):
-        # What is done is not done again.
-        runs.append(timed_fleet(what, folder / f'of_{workers}', workers))
-        print(runs[-1], flush=True)
+    logs = plants(folder, given.units, given.months)
+    early = [p for u in logs[:4] for p in sorted(u.glob('*.csv'))[: given.twice]]
+    # What is done is not done again.
+    runs = [
+        timed_fleet(what, folder / f'of_{workers}', workers)
+        for what, workers in ((early, 1), (early, 2), (logs, 2))
+    ]
     one, two = runs[:2]
     tasks, verbs, cpu, count = (
         sum(r[k] for r in runs) for k in ('task_s', 'verbs_s', 'cpu_s', 'tasks')
     )
+    free = one['cpu_s'] / two['cpu_s'] * two['task_s'] / two['wall_s']
+    first, second = (digests(folder / name) for name in ('of_1', 'of_2'))
     return {
         'runs': runs,
         'times_one_worker': round(one['wall_s'] / two['wall_s'], 2),
-        'times_on_free_cores': round(
-            one['cpu_s'] / two['cpu_s'] * two['task_s'] / two['wall_s'], 2
-        ),
+        'times_on_free_cores': round(free, 2),
         'work_s_per_task': round(verbs / count, 2),
         'cpu_s_per_task': round(cpu / count, 2),
         'beside_work_ms_per_task': round(1000.0 * (tasks - verbs) / count, 1),
         'sizes': sizes(folder / 'of_2', logs),
-        'one_and_two_workers_identical': (
-            digests(folder / 'of_1').items() <= digests(folder / 'of_2').items()
-        ),
+        'one_and_two_workers_identical': first.items() <= second.items(),
     }
 
 
-def part_faults(folder: Path, o: Any) -> dict[str, Any]:
+def part_faults(folder: Path, given: argparse.Namespace) -> dict[str, Any]:
     """Run all units again, disturbed; compare with the runs of `part_speed` in the folder."""
-    logs = plants(folder, o.units, o.months)
+    logs = plants(folder, given.units, given.months)
     calm = digests(folder / 'of_2')
-    broken = break_logs(folder, logs, o.broken)
+    broken = break_logs(folder, logs, given.broken)
     out = folder / 'disturbed'
-    found = disturbed(broken, out, o.kills, len(calm) + o.broken)
-    rows = pd.DataFrame(_frame(out))
+    found = disturbed(broken, out, given.kills, len(calm) + given.broken)
+    rows = FleetResult(out, (), 0, 0, 0).to_dataframe()
     bad = rows[rows.log.str.contains('broken')]
-    after = digests(out, skip='_broken')
+    after = digests(out)
     return found | {
-        'broken_logs': o.broken, 'rows_of_broken_logs': len(bad),
+        'broken_logs': given.broken, 'rows_of_broken_logs': len(bad),
         'their_sentences': sorted({
             ' '.join(s).rsplit('/', 1)[-1][:120] for s in bad.sentences
         }),
@@ -314,36 +282,19 @@ def part_faults(folder: Path, o: Any) -> dict[str, Any]:
 PARTS = {'scheduling': part_scheduling, 'speed': part_speed, 'faults': part_faults}
 
 
-def _frame(out: Path) -> Any:
-    from valveflow_ros.interface.fleets.fleet import FleetResult
-
-    return FleetResult(out, (), 0, 0, 0).to_dataframe()
-
-
-def main() -> int:
-    """Measure, print, and write where it was asked for."""
+def main() -> None:
     parser = study.options(
-        (__doc__ or '').split('\n')[0],
-        units=10,
-        months=20,
-        twice=10,
-        kills=20,
-        broken=10,
-        tiny=10_000,
+        __doc__, units=10, months=20, twice=10, kills=20, broken=10, tiny=10_000
     )
     parser.add_argument('--parts', nargs='+', choices=list(PARTS), default=list(PARTS))
     parser.add_argument('--folder', type=Path, help='keeps the simulated logs and the results')
     parser.add_argument('--output', type=Path, help='folder for fleet_PART.json')
-    options = parser.parse_args()
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        for part in options.parts:
-            found = PARTS[part](options.folder or Path(place), options)
-            print(json.dumps({part: found}, indent=1), flush=True)
-            if options.output is not None:
-                content = {'machine': study.machine(), **found}
-                study.keep(f'fleet_{part}', folder=options.output, **content)
-    return 0
+        for part in given.parts:
+            found = PARTS[part](given.folder or Path(place), given)
+            study.keep(f'fleet_{part}', given.output, machine=study.machine(), **found)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

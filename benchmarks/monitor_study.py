@@ -15,8 +15,9 @@ looking at such units was set on seeds 421 to 430.
 
 from __future__ import annotations
 
+import argparse
+import itertools
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,19 +30,9 @@ from valveflow_ros.plant.effects import catalogue
 from valveflow_ros.plant.thermal_effects import thermal_catalogue
 
 _DAY_NS = 86_400_000_000_000
-_PAPER = 'paper'
 # What spoils values is no change of the plant; a limit has no size that could be multiplied, and
 # the back pressure of a choked valve cannot be three times as high.
 _LEFT_OUT = ('choked', 'flatline', 'quantisation', 'rate_limit', 'saturation', 'spikes')
-
-
-def record_of(kind: str, seed: int, days: float, effects: list[str]) -> pd.DataFrame:
-    """Return means over a minute of a unit."""
-    if kind != _PAPER:
-        unit = f'{kind}:number={seed}'
-        return vf.simulate(days, seed, effects, unit=unit, recording='minute').to_dataframe()
-    table = vf.simulate(days, seed, effects).to_dataframe().set_index('time')
-    return table.resample('60s').mean().reset_index()
 
 
 def joined(healthy: pd.DataFrame, faulty: pd.DataFrame) -> pd.DataFrame:
@@ -59,22 +50,36 @@ def effect_at(effect: Effect, times: float) -> str:
     return f'{effect.name}:{size.name}={value:g}{onset}'
 
 
-def row_of(
-    seed: int, kind: str, days: float, effect: str = '', wear: float = 0.0, vacuum: float = 0.0
-) -> dict[str, Any]:
+def units(given: argparse.Namespace) -> list[tuple[str, str, int]]:
+    """Return kind, effect and seed of every unit."""
+    found: list[tuple[str, str, int]] = []
+    for kind in given.kinds.split(','):
+        own = catalogue() if kind == study.PAPER else thermal_catalogue()
+        chosen = [
+            effect_at(e, given.times) for e in own.values()
+            if e.name not in _LEFT_OUT and (e.name in given.effect or 'all' in given.effect)
+        ]  # fmt: skip
+        found += itertools.product([kind], chosen if given.effect else [''], study.seeds(given))
+    return found
+
+
+def row_of(unit: tuple[str, str, int], given: argparse.Namespace) -> dict[str, Any]:
     """Run the monitor over one unit; return what it told."""
-    record = record_of(kind, seed, days, [])
-    if wear:
+    kind, effect, seed = unit
+    record = study.minute_means(kind, seed, seed, given.days)
+    if given.wear:
         month = np.asarray(record['time'] - record['time'].iloc[0]) / np.timedelta64(30, 'D')
         power = record['generated_power_mw'].to_numpy()
-        record['generated_power_mw'] = power * (1.0 - wear / power.mean() * month)
+        record['generated_power_mw'] = power * (1.0 - given.wear / power.mean() * month)
     if effect:
-        record = joined(record, record_of(kind, seed, days, [effect]))
+        record = joined(record, study.minute_means(kind, seed, seed, given.days, [effect]))
     begin = time.process_time()
     model = None
-    if vacuum:
-        first = record[record['time'] < record['time'].iloc[0] + pd.Timedelta(days=vacuum)]
-        diagnosed = vf.diagnose(first, covariates={'vacuum': 'condenser_pressure_kpa'})
+    if given.vacuum:
+        end = record['time'].iloc[0] + pd.Timedelta(days=given.vacuum)
+        diagnosed = vf.diagnose(
+            record[record['time'] < end], covariates={'vacuum': 'condenser_pressure_kpa'}
+        )
         model = diagnosed.extended_model if diagnosed.diagnosis.causes else None
     found = vf.monitor(record, diagnose=False, model=model)
     content = found.to_json()
@@ -82,18 +87,18 @@ def row_of(
     def day(time_ns: int) -> float:
         return round((time_ns - found.start_ns) / _DAY_NS, 2)
 
-    alarms = {
-        name: {
-            'raised_days': [day(a['raised']) for a in own],
-            'state': own[-1]['state'] if own else '',
-            'stands': bool(own) and (own[-1]['cleared'] is None or _hidden(own[-1])),
-        }
-        for name in ('residual', 'curve_shift')
-        for own in [[a for a in content['alarms'] if a['name'] == name]]
-    }
+    def told(name: str) -> dict[str, Any]:
+        own = [a for a in content['alarms'] if a['name'] == name]
+        state = own[-1]['state'] if own else ''
+        # One that is only not to be judged for the moment stands too.
+        stands = bool(own) and (own[-1]['cleared'] is None or state == 'suppressed')
+        days = [day(a['raised']) for a in own]
+        return {'raised_days': days, 'state': state, 'stands': stands}
+
     reference = content['reference']
     return {
-        'kind': kind, 'seed': seed, 'effect': effect, 'alarms': alarms,
+        'kind': kind, 'seed': seed, 'effect': effect,
+        'alarms': {name: told(name) for name in ('residual', 'curve_shift')},
         'reference_day': None if reference is None else day(reference['set']),
         'held': [] if model is None else list(model.model.names),
         'wear': content['wear'] and round(content['wear']['mw_per_month'], 3),
@@ -101,61 +106,35 @@ def row_of(
     }  # fmt: skip
 
 
-def _hidden(alarm: dict[str, Any]) -> bool:
-    """Tell whether an alarm is only not to be judged for the moment."""
-    return alarm['state'] == 'suppressed'
-
-
-def summary_of(rows: list[dict[str, Any]], onset_days: float) -> dict[str, Any]:
+def summary(rows: list[dict[str, Any]], onset_days: float) -> dict[str, Any]:
     """Return what the units of one kind come to; only alarms since the onset count."""
     since = [
-        [[d for d in a['raised_days'] if d >= onset_days] for a in r['alarms'].values()]
+        [sum(d >= onset_days for d in a['raised_days']) for a in r['alarms'].values()]
         for r in rows
     ]
-    found = [any(own) for own in since]
     stands = [any(a['stands'] for a in r['alarms'].values()) for r in rows]
     return {
-        'units': len(rows), 'with_alarm': sum(found),
-        'alarms': sum(len(d) for own in since for d in own),
-        'standing_at_the_end': sum(np.logical_and(found, stands).tolist()),
-        'most_occurrences': max(len(d) for own in since for d in own),
+        'units': len(rows), 'with_alarm': sum(any(own) for own in since),
+        'alarms': sum(map(sum, since)),
+        'standing_at_the_end': sum(any(o) and s for o, s in zip(since, stands, strict=True)),
+        'most_occurrences': max(map(max, since)),
     }  # fmt: skip
 
 
 def main() -> None:
-    """Run the study and write it beside the others."""
-    parser = study.options(__doc__, seeds=10, first=431, days=20.0, times=3.0)
+    parser = study.options(
+        __doc__, seeds=10, first=431, days=20.0, times=3.0, wear=0.0, vacuum=0.0
+    )
     parser.add_argument('--kinds', default='choked,sequence,paper')
     parser.add_argument('--effect', action='append', default=[])
-    parser.add_argument('--wear', type=float, default=0.0)
-    parser.add_argument('--vacuum', type=float, default=0.0)
     given = parser.parse_args()
-    onset_days = 0.5 * given.days if given.effect else 0.0
-    rows: list[dict[str, Any]] = []
-    for kind in given.kinds.split(','):
-        own = catalogue() if kind == _PAPER else thermal_catalogue()
-        named = [e for e in own.values() if e.name not in _LEFT_OUT]
-        chosen = [e for e in named if e.name in given.effect or 'all' in given.effect]
-        effects = [effect_at(e, given.times) for e in chosen] if given.effect else ['']
-        for effect in effects:
-            work = partial(
-                row_of,
-                kind=kind,
-                days=given.days,
-                effect=effect,
-                wear=given.wear,
-                vacuum=given.vacuum,
-            )
-            rows += study.rows_of(work, study.seeds(given.first, given.seeds))
     what = f'wear_{given.wear:g}' if given.wear else 'healthy'
     what = f'{"_".join(given.effect)}_times_{given.times:g}' if given.effect else what
-    what += '_vacuum' if given.vacuum else ''
-    groups = {r['kind']: [s for s in rows if s['kind'] == r['kind']] for r in rows}
-    study.keep(
-        study.name_of(f'monitor_{what}', given.first, given.seeds),
-        summary={kind: summary_of(own, onset_days) for kind, own in groups.items()},
-        rows=rows,
-    )
+    name = study.name_of(f'monitor_{what}{"_vacuum" if given.vacuum else ""}', given)
+    rows = study.rows_of(name, row_of, units(given), given)
+    onset = 0.5 * given.days if given.effect else 0.0
+    groups = study.by('kind', rows)
+    study.keep(name, summary={k: summary(own, onset) for k, own in groups.items()}, rows=rows)
 
 
 if __name__ == '__main__':

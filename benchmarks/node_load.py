@@ -27,7 +27,6 @@ import argparse
 import os
 import sys
 import tempfile
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -36,31 +35,36 @@ import rclpy
 from benchmarks import study
 from benchmarks.load.cases import BOTH, CASES, SOAK, cases
 from benchmarks.load.trial import result_of
-
-_DOMAINS = 101
-
-
-def run_all(options: argparse.Namespace) -> list[str]:
-    """Run the cases asked for, write a file for each name; return the sentences of what failed."""
-    failed: list[str] = []
-    for name in options.cases or CASES:
-        before = os.getloadavg()
-        found: list[dict[str, Any]] = []
-        for reliable in qualities(name, options):
-            for case in cases(name, options.full, reliable, options.hours):
-                with tempfile.TemporaryDirectory(prefix='node_load') as folder:
-                    found.append(result_of(case, Path(folder)))
-                print('\n'.join(lines(found[-1])), flush=True)
-                wrong = found[-1]['faults'] + (found[-1]['over_limits'] if options.strict else [])
-                failed += [f'{case.name}: {sentence}' for sentence in wrong]
-        write(name, found, before, options)
-    return failed
+from benchmarks.processes import own_domain
 
 
-def qualities(name: str, options: argparse.Namespace) -> tuple[bool, ...]:
-    """Return whether to send reliably, for each of the runs of a name."""
-    wanted = options.qos or ('both' if options.full or name in BOTH else 'best_effort')
-    return {'both': (False, True), 'reliable': (True,)}.get(wanted, (False,))
+def run(name: str, given: argparse.Namespace) -> list[str]:
+    """Run the cases of a name and write what was found; return the sentences of what failed."""
+    before = os.getloadavg()
+    found: list[dict[str, Any]] = []
+    wanted = given.qos or ('both' if given.full or name in BOTH else 'best_effort')
+    for reliable in {'both': (False, True), 'reliable': (True,)}.get(wanted, (False,)):
+        for case in cases(name, given.full, reliable, given.hours):
+            with tempfile.TemporaryDirectory(prefix='node_load') as folder:
+                found.append(result_of(case, Path(folder)))
+            print('\n'.join(lines(found[-1])), flush=True)
+    words = [name, *(['--full'] if given.full else [])]
+    words += ['--qos', given.qos] if given.qos else []
+    words += ['--hours', f'{given.hours:g}'] if name == SOAK else []
+    study.keep(
+        f'node_load_{name}', given.output, show=False, command=study.command(*words),
+        passed=not any(r['faults'] for r in found),
+        within_limits=not any(r['over_limits'] for r in found),
+        machine={
+            **study.machine(), 'load_before': before,
+            'middleware': os.environ.get('RMW_IMPLEMENTATION', 'the default one'),
+        },
+        runs=found,
+    )  # fmt: skip
+    return [
+        f'{r["case"]}: {sentence}' for r in found
+        for sentence in r['faults'] + (r['over_limits'] if given.strict else [])
+    ]  # fmt: skip
 
 
 def lines(result: dict[str, Any]) -> list[str]:
@@ -84,50 +88,20 @@ def lines(result: dict[str, Any]) -> list[str]:
     return said + [f'  over its limit: {sentence}' for sentence in result['over_limits']]
 
 
-def write(
-    name: str, found: list[dict[str, Any]], before: tuple[float, ...], options: argparse.Namespace
-) -> None:
-    """Write what was found, with the machine it was found on."""
-    given = [name, *(['--full'] if options.full else [])]
-    given += ['--qos', options.qos] if options.qos else []
-    given += ['--hours', f'{options.hours:g}'] if name == SOAK else []
-    study.keep(
-        f'node_load_{name}', folder=options.output, command=study.command(*given),
-        passed=not any(r['faults'] for r in found),
-        within_limits=not any(r['over_limits'] for r in found),
-        machine={
-            **study.machine(), 'load_before': before, 'load_after': os.getloadavg(),
-            'rclpy': _version('rclpy'),
-            'middleware': os.environ.get('RMW_IMPLEMENTATION', 'the default one'),
-        },
-        runs=found,
-    )  # fmt: skip
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except LookupError:
-        return 'unknown'
-
-
 def main() -> int:
-    """Run the benchmark."""
-    parser = study.options(__doc__)
+    parser = study.options(__doc__, hours=8.0)
     parser.add_argument('cases', nargs='*', metavar='CASE', help=', '.join((*CASES, SOAK)))
     parser.add_argument('--full', action='store_true', help='as long as the figures ask for')
     parser.add_argument('--qos', choices=('best_effort', 'reliable', 'both'))
-    parser.add_argument('--hours', type=float, default=8.0, help='of the soak (default 8)')
     parser.add_argument('--strict', action='store_true', help='a passed limit fails, too')
     parser.add_argument('--output', type=Path, default=study.RESULTS)
-    options = parser.parse_args()
-    unknown = [name for name in options.cases if name not in (*CASES, SOAK)]
+    given = parser.parse_args()
+    unknown = [name for name in given.cases if name not in (*CASES, SOAK)]
     if unknown:
         parser.error(f'there is no case {unknown[0]}; there are {", ".join((*CASES, SOAK))}')
-    os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % _DOMAINS + 1)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    own_domain()
     rclpy.init(args=[])
-    failed = run_all(options)
+    failed = [sentence for name in given.cases or CASES for sentence in run(name, given)]
     rclpy.try_shutdown()
     for sentence in failed:
         print(f'node_load: {sentence}', file=sys.stderr)

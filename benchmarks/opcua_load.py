@@ -16,8 +16,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -29,11 +27,11 @@ from typing import Any
 import psutil
 
 from benchmarks import study
+from benchmarks.processes import free_port, own_domain, running
 from valveflow_ros.records import SIGNALS
 
 _UNITS, _RATE_HZ = 10, 10.0
-_UNIT_OF = {'valve_opening': '%', 'main_steam_pressure': 'MPa', 'main_steam_temperature': 'degC',
-            'generated_power': 'MW', 'valve_command': '%'}  # fmt: skip
+_SIGNALS = _UNITS * len(SIGNALS)
 _PATIENCE_S = 120.0
 
 
@@ -46,12 +44,11 @@ async def serve(port: int) -> None:
     server.set_endpoint(f'opc.tcp://127.0.0.1:{port}')
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     index = await server.register_namespace('urn:load')
+    names = [f'U{k}.{info.topic}' for k in range(_UNITS) for info in SIGNALS]
     nodes = [
-        await server.nodes.objects.add_variable(
-            ua.NodeId(f'U{k}.{info.topic}', index), f'{index}:U{k}.{info.topic}', 1.0
-        )
-        for k in range(_UNITS) for info in SIGNALS
-    ]  # fmt: skip
+        await server.nodes.objects.add_variable(ua.NodeId(name, index), f'{index}:{name}', 1.0)
+        for name in names
+    ]
     await server.start()
     print('ready', flush=True)
     line = await asyncio.to_thread(sys.stdin.readline)
@@ -62,7 +59,7 @@ async def serve(port: int) -> None:
             for k, node in enumerate(nodes):
                 await node.write_value(ua.Variant(10.0 + k + (count % 1000) / 1e4))
             await asyncio.sleep(max(0.0, begun_s + count / _RATE_HZ - time.monotonic()))
-        print(json.dumps({'changes': count * len(nodes)}), flush=True)
+        print(count * len(nodes), flush=True)
         await asyncio.to_thread(sys.stdin.readline)
 
 
@@ -72,7 +69,6 @@ def start_server(port: int) -> subprocess.Popen[str]:
         [sys.executable, '-m', 'benchmarks.opcua_load', '--serve', str(port)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
-    assert made.stdout is not None
     if made.stdout.readline() != 'ready\n':
         raise SystemExit('the server did not start')
     return made
@@ -82,8 +78,8 @@ def write_mapping(folder: Path, port: int) -> Path:
     """Write the mapping of all units."""
     units = [
         {'namespace': f'/u{k}', 'tag': f'U{k}', 'signals': {
-            topic: {'node': f'nsu=urn:load;s=U{k}.{topic}', 'unit': unit}
-            for topic, unit in _UNIT_OF.items()
+            info.topic: {'node': f'nsu=urn:load;s=U{k}.{info.topic}', 'unit': info.unit}
+            for info in SIGNALS
         }}
         for k in range(_UNITS)
     ]  # fmt: skip
@@ -106,16 +102,16 @@ class Listener:
         from valveflow_msgs.msg import PlantSample
 
         rclpy.init()
-        self._node = rclpy.create_node('opcua_load')
+        node = rclpy.create_node('opcua_load')
         self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
+        self._executor.add_node(node)
         self.counts: dict[str, dict[str, str]] = {}
-        self.samples = self.good = 0
+        self.good = 0
         self.ages_s: list[float] = []
         self.last_good_ns = [0] * _UNITS
-        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 100)
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 100)
         for k in range(_UNITS):
-            self._node.create_subscription(
+            node.create_subscription(
                 PlantSample, f'/u{k}/plant_sample', lambda m, k=k: self._on_sample(m, k), 100
             )
 
@@ -125,11 +121,9 @@ class Listener:
 
     def _on_sample(self, message: Any, unit: int) -> None:
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        good = all(getattr(message, f'{info.topic}_quality') == 1 for info in SIGNALS)
-        self.samples += 1
-        self.good += good
         self.ages_s.append((time.time_ns() - stamp_ns) / 1e9)
-        if good:
+        if all(getattr(message, f'{info.topic}_quality') == 1 for info in SIGNALS):
+            self.good += 1
             self.last_good_ns[unit] = stamp_ns
 
     def spin(self, seconds: float) -> None:
@@ -142,105 +136,95 @@ class Listener:
         """Return a count of all signals, or of all links."""
         return sum(int(float(v[key])) for v in self.counts.values() if key in v)
 
-    def until_good(self, after_ns: int) -> float:
-        """Return how long it took until every unit has a good sample from after a time, in s."""
-        while min(self.last_good_ns) <= after_ns:
-            if time.time_ns() - after_ns > _PATIENCE_S * 1e9:
+    def until_good(self) -> float:
+        """Return how long it takes until every unit has a good sample from after now, in s."""
+        begun_ns = time.time_ns()
+        while min(self.last_good_ns) <= begun_ns:
+            if time.time_ns() - begun_ns > _PATIENCE_S * 1e9:
                 raise SystemExit('good samples did not come')
             self.spin(0.05)
-        return (time.time_ns() - after_ns) / 1e9
+        return (time.time_ns() - begun_ns) / 1e9
 
 
-def measured(folder: Path, port: int, seconds: float, restarts: int) -> dict[str, Any]:
+def under_load(
+    listener: Listener, server: subprocess.Popen[str], gateway: psutil.Process, seconds: float
+) -> dict[str, Any]:
+    """Let the server change its values; return what came of it."""
+    listener.until_good()
+    # Every value once, when the subscription begins, told by the next message of the health.
+    while listener.total('received') < _SIGNALS:
+        listener.spin(0.5)
+    listener.spin(2.0)
+    before, losses = listener.total('received'), listener.total('losses')
+    used = gateway.cpu_times()
+    listener.good = 0
+    listener.ages_s.clear()
+    server.stdin.write(f'go {seconds}\n')
+    server.stdin.flush()
+    listener.spin(seconds)
+    after = gateway.cpu_times()
+    written = int(server.stdout.readline())
+    good, ages = listener.good, sorted(listener.ages_s)
+    listener.spin(4.0)
+    used_s = after.user + after.system - used.user - used.system
+    return {
+        'signals': _SIGNALS, 'seconds': seconds, 'changes_written': written,
+        'changes_received': listener.total('received') - before,
+        'changes_lost': listener.total('lost'), 'messages_lost': listener.total('messages_lost'),
+        'messages_sent_again': listener.total('messages_sent_again'),
+        'links_lost': listener.total('losses') - losses, 'received_before': before,
+        'samples': len(ages), 'samples_good': good,
+        'sample_age_s_median': round(statistics.median(ages), 3),
+        'sample_age_s_worst': round(ages[-1], 3),
+        'core_percent': round(100.0 * used_s / seconds, 1),
+        'memory_mb': round(gateway.memory_info().rss / 1e6, 1),
+    }  # fmt: skip
+
+
+def measured(folder: Path, port: int, given: argparse.Namespace) -> dict[str, Any]:
     """Return every figure by its name."""
     server = start_server(port)
-    mapping = write_mapping(folder, port)
-    log = (folder / 'gateway.log').open('wb')
-    gateway = subprocess.Popen(
-        [sys.executable, '-m', 'valveflow_ros.ros.gateway_main', '--ros-args', '-p',
-         f'mapping_file:={mapping}'], stdout=log, stderr=log,
-    )  # fmt: skip
+    words = ('-m', 'valveflow_ros.ros.gateway_main', '--ros-args', '-p',
+             f'mapping_file:={write_mapping(folder, port)}')  # fmt: skip
     listener = Listener()
     try:
-        listener.until_good(time.time_ns())
-        # Every value once, when the subscription begins, told by the next message of the health.
-        while listener.total('received') < _UNITS * len(SIGNALS):
-            listener.spin(0.5)
-        listener.spin(2.0)
-        before, losses = listener.total('received'), listener.total('losses')
-        seen = psutil.Process(gateway.pid)
-        used = seen.cpu_times()
-        listener.samples = listener.good = 0
-        listener.ages_s.clear()
-        assert server.stdin is not None
-        assert server.stdout is not None
-        server.stdin.write(f'go {seconds}\n')
-        server.stdin.flush()
-        listener.spin(seconds)
-        after = seen.cpu_times()
-        written = json.loads(server.stdout.readline())['changes']
-        samples, good, ages = listener.samples, listener.good, sorted(listener.ages_s)
-        listener.spin(4.0)
-        used_s = after.user + after.system - used.user - used.system
-        found: dict[str, Any] = {
-            'signals': _UNITS * len(SIGNALS), 'seconds': seconds, 'changes_written': written,
-            'changes_received': listener.total('received') - before,
-            'changes_lost': listener.total('lost'),
-            'messages_lost': listener.total('messages_lost'),
-            'messages_sent_again': listener.total('messages_sent_again'),
-            'links_lost': listener.total('losses') - losses,
-            'received_before': before,
-            'samples': samples, 'samples_good': good,
-            'sample_age_s_median': round(statistics.median(ages), 3),
-            'sample_age_s_worst': round(ages[-1], 3),
-            'core_percent': round(100.0 * used_s / seconds, 1),
-            'memory_mb': round(seen.memory_info().rss / 1e6, 1),
-        }  # fmt: skip
-        back = []
-        for _ in range(restarts):
-            server.kill()
-            server.wait()
-            listener.spin(1.0)
-            server = start_server(port)
-            back.append(listener.until_good(time.time_ns()))
-        if back:
-            found |= {
-                'restarts': restarts, 'back_s_median': round(statistics.median(back), 2),
-                'back_s_worst': round(max(back), 2),
-                'losses_per_unit': listener.total('losses') / _UNITS,
-                'memory_mb_end': round(seen.memory_info().rss / 1e6, 1),
-            }  # fmt: skip
-        gateway.terminate()
-        found['exit_status'] = gateway.wait(30)
+        with running(folder / 'gateway.log', *words) as gateway:
+            seen = psutil.Process(gateway.pid)
+            found = under_load(listener, server, seen, given.seconds)
+            back = []
+            for _ in range(given.restarts):
+                server.kill()
+                server.wait()
+                listener.spin(1.0)
+                server = start_server(port)
+                back.append(listener.until_good())
+            if back:
+                found |= {
+                    'restarts': given.restarts, 'back_s_median': round(statistics.median(back), 2),
+                    'back_s_worst': round(max(back), 2),
+                    'losses_per_unit': listener.total('losses') / _UNITS,
+                    'memory_mb_end': round(seen.memory_info().rss / 1e6, 1),
+                }  # fmt: skip
+            gateway.terminate()
+            found['exit_status'] = gateway.wait(30)
     finally:
-        gateway.kill()
         server.kill()
-        log.close()
     return found | study.machine()
 
 
-def main() -> int:
-    """Measure, print, and write where it was asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
-    parser.add_argument('--seconds', type=float, default=600.0, help='length of the load')
-    parser.add_argument('--restarts', type=int, default=5, help='kills of the server')
+def main() -> None:
+    parser = study.options(__doc__, seconds=600.0, restarts=5)
     parser.add_argument('--output', type=Path, help='folder for opcua_load.json')
     parser.add_argument('--serve', type=int, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.serve:
-        asyncio.run(serve(options.serve))
-        return 0
-    os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 101 + 1))
-    with socket.create_server(('127.0.0.1', 0)) as free:
-        port = int(free.getsockname()[1])
+    given = parser.parse_args()
+    if given.serve:
+        asyncio.run(serve(given.serve))
+        return
+    own_domain()
     with tempfile.TemporaryDirectory() as folder:
-        found = measured(Path(folder), port, options.seconds, options.restarts)
-    for name, value in found.items():
-        print(f'{name:24} {value}')
-    if options.output is not None:
-        study.keep('opcua_load', folder=options.output, **found)
-    return 0
+        found = measured(Path(folder), free_port(), given)
+    study.keep('opcua_load', given.output, **found)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -4,26 +4,19 @@
 
 Run: ``python -m benchmarks.paper_study --seeds 20 --first 1000``. Each seed is ten days at 1 s
 of the plant of eqs. (30)-(31). Both curves are judged: the published one, and the exact
-partition's of the special segments alone with the paper's rule (24). With ``--irregular`` a
-gateway sends each signal by itself: three readings in ten are missing, the others come up to 0.4 s
-early or late, and the aligner makes a table of them.
+partition's of the special segments alone with the paper's rule (24).
 """
 
 from __future__ import annotations
 
 import time
-from functools import partial
+from typing import Any
 
 import numpy as np
 
 from benchmarks import study
 from valveflow_ros.curve.characteristic import Piece
-from valveflow_ros.fit.fit import fit
-from valveflow_ros.parameters import Settings
-from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription, paper_curve
-from valveflow_ros.records import Readings, SampleTable, table_to_readings
-from valveflow_ros.signals.align import Aligner
 
 
 def errors(pieces: tuple[Piece, ...]) -> dict[str, float]:
@@ -44,41 +37,22 @@ def errors(pieces: tuple[Piece, ...]) -> dict[str, float]:
     return out
 
 
-def irregular(table: SampleTable, seed: int, settings: Settings) -> SampleTable:
-    """Return the table that the aligner makes of readings at odd moments, some missing."""
-    readings = table_to_readings(table)
-    rng = np.random.default_rng(seed)
-    keep = rng.random(len(readings)) < 0.7
-    moved = readings.time_ns + rng.integers(-4e8, 4e8, len(readings))
-    order = np.flatnonzero(keep)[np.argsort(moved[keep], kind='stable')]
-    odd = Readings(
-        moved[order], readings.signal[order], readings.value[order], readings.quality[order]
-    )
-    return Aligner(settings).feed(odd).table
-
-
-def judged(seed: int, days: float, odd: bool) -> dict[str, object]:
-    """Simulate one plant and identify it."""
-    table = simulate(days, seed).table
-    settings = study.whole_window(UnitDescription(), days)
+def judged(seed: int, days: float) -> dict[str, Any]:
     begin = time.perf_counter()
-    found = fit(study.task_of(irregular(table, seed, settings) if odd else table, settings)[0])
+    found = study.identify(UnitDescription(), seed, days)
     return {
-        'seed': seed,
-        'seconds': round(time.perf_counter() - begin, 2),
-        'special_samples': found.source.samples,
-        'published': errors(found.pieces),
+        'seed': seed, 'seconds': round(time.perf_counter() - begin, 2),
+        'special_samples': found.source.samples, 'published': errors(found.pieces),
         'partition': errors(found.partition_pieces),
-    }
+    }  # fmt: skip
 
 
-def summary(rows: list[dict[str, object]], which: str) -> str:
+def summary(rows: list[dict[str, Any]], which: str) -> str:
     """Return one line on one of the curves."""
     found = [row[which] for row in rows]
-    right = [f for f in found if 'slope' in f]  # type: ignore[operator]
-    slopes = np.array([f['slope'] for f in right])  # type: ignore[index]
-    knees = np.array([f['knee'] for f in right])  # type: ignore[index]
-    curve = np.array([f['curve_rmse_mw'] for f in found])  # type: ignore[index]
+    right = [f for f in found if 'slope' in f]
+    slopes, knees = (np.array([f[key] for f in right]) for key in ('slope', 'knee'))
+    curve = np.array([f['curve_rmse_mw'] for f in found])
     return (
         f'{which}: J right {len(right)}/{len(found)}; largest slope error median '
         f'{np.median(slopes):.4f} worst {slopes.max():.4f}; largest knee error median '
@@ -88,17 +62,11 @@ def summary(rows: list[dict[str, object]], which: str) -> str:
 
 
 def main() -> None:
-    """Run the study, print it, and write it beside the other results."""
-    parser = study.options(__doc__, seeds=10, first=1, days=10.0)
-    parser.add_argument('--irregular', action='store_true')
-    args = parser.parse_args()
-    work = partial(judged, days=args.days, odd=args.irregular)
-    rows = study.rows_of(work, study.seeds(args.first, args.seeds))
+    given = study.options(__doc__, seeds=10, first=1, days=10.0).parse_args()
+    name = study.name_of('paper_study', given)
+    rows = study.rows_of(name, judged, study.seeds(given), given.days)
     lines = [summary(rows, which) for which in ('published', 'partition')]
-    print('\n'.join(lines))
-    kind = 'paper_study_irregular' if args.irregular else 'paper_study'
-    name = study.name_of(kind, args.first, args.seeds)
-    study.keep(name, days=args.days, summary=lines, rows=rows)
+    study.keep(name, days=given.days, summary=lines, rows=rows)
 
 
 if __name__ == '__main__':

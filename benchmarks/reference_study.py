@@ -11,8 +11,8 @@ the same unit unchanged.
 
 from __future__ import annotations
 
+import itertools
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ import pandas as pd
 import valveflow_ros as vf
 from benchmarks import study
 
-KINDS = ('paper', 'choked', 'sequence', 'integrated_input')
+KINDS = (study.PAPER, 'choked', 'sequence', 'integrated_input')
 _NAMES = {
     'none': '', 'gain': 'gain_change', 'offset': 'offset_change', 'input': 'input_change',
     'curve': 'curve_change',
@@ -30,37 +30,26 @@ _SIZES = (0.01, 0.02, 0.04)
 _OTHER_WEATHER = 500_000
 
 
-def record_of(kind: str, seed: int, weather: int, days: float) -> pd.DataFrame:
-    """Return a record of one unit as means over a minute."""
-    if kind != 'paper':
-        unit = f'{kind}:number={seed}'
-        return vf.simulate(days, weather, [], unit=unit, recording='minute').to_dataframe()
-    table = vf.simulate(days, weather, []).to_dataframe().set_index('time')
-    return table.resample('60s').mean().reset_index()
-
-
 def changed(record: pd.DataFrame, what: str, size: float) -> tuple[pd.DataFrame, float]:
     """Return a record of a unit that changed by a share of its power, and the true number."""
     record = record.copy()
     power, opening = record['generated_power_mw'], record['valve_opening_percent']
-    if what == 'gain':
-        record['generated_power_mw'] = (1.0 + size) * power
-    elif what == 'offset':
+    if what in ('offset', 'curve'):
         size *= float(power.quantile(0.99))
-        record['generated_power_mw'] = power + size
-    elif what == 'input':
+    above = 1.0 / (1.0 + np.exp(-(opening - opening.median()) / 2.0))
+    if what == 'input':
         record['valve_opening_percent'] = opening / (1.0 + size)
-    elif what == 'curve':
-        size *= float(power.quantile(0.99))
-        above = 1.0 / (1.0 + np.exp(-(opening - opening.median()) / 2.0))
-        record['generated_power_mw'] = power + size * above
+    elif what != 'none':
+        added = {'gain': size * power, 'offset': size, 'curve': size * above}
+        record['generated_power_mw'] = power + added[what]
     return record, size
 
 
-def rows_of(seed: int, kind: str, days: float) -> list[dict[str, Any]]:
+def rows_of(unit: tuple[str, int], days: float) -> list[dict[str, Any]]:
     """Diagnose one unit with every change, a model of earlier days given."""
-    curve = vf.identify(record_of(kind, seed, seed, days)).characteristic
-    later = record_of(kind, seed, seed + _OTHER_WEATHER, days)
+    kind, seed = unit
+    curve = vf.identify(study.minute_means(kind, seed, seed, days)).characteristic
+    later = study.minute_means(kind, seed, seed + _OTHER_WEATHER, days)
     drawn = np.random.default_rng(seed)
     rows = []
     for what, name in _NAMES.items():
@@ -72,28 +61,25 @@ def rows_of(seed: int, kind: str, days: float) -> list[dict[str, Any]]:
         told = [c.name for c in since]
         near = [n for c in since for n in c.not_told_apart]
         sizes = {k: e for c in since for k, e in c.parameters.items()}
-        row = {
+        one_number = told == [name] != ['curve_change']
+        rows.append({
             'kind': kind, 'seed': seed, 'change': what, 'size': round(size, 4),
             'verdict': found.verdict, 'named': [c.name for c in found.causes], 'near': near,
             'sizes': {k: [e.value, e.low, e.high] for k, e in sizes.items()},
             'rmse_mw': [round(r, 3) for r in (found.rmse_simulation, found.rmse_extended)],
             'cpu_s': round(time.process_time() - begin, 1),
-        }  # fmt: skip
-        row['right'] = told == ([name] if name else [])
-        row['wider'] = told == ['curve_change'] and (name in near or what == 'curve')
-        one_number = told == [name] != ['curve_change']
-        row['holds'] = [e.low <= size <= e.high for e in sizes.values()] if one_number else []
-        row['others'] = [n for n in row['named'] if n not in told]
-        rows.append(row)
+            'right': told == ([name] if name else []),
+            'wider': told == ['curve_change'] and (name in near or what == 'curve'),
+            'holds': [e.low <= size <= e.high for e in sizes.values()] if one_number else [],
+            'others': [c.name for c in found.causes if c not in since],
+        })  # fmt: skip
     return rows
 
 
-def summary_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what the units of one kind come to, by change."""
-    out = {}
-    for what in _NAMES:
-        mine = [r for r in rows if r['change'] == what]
-        out[what] = {
+    return {
+        what: {
             'records': len(mine),
             'right': sum(r['right'] for r in mine),
             'as_curve_change': sum(r['wider'] and not r['right'] for r in mine),
@@ -103,27 +89,19 @@ def summary_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
             f'{sum(len(r["holds"]) for r in mine)}',
             'other_names': sorted(n for r in mine for n in r['others']),
         }
-    return out
+        for what, mine in study.by('change', rows).items()
+    }
 
 
 def main() -> None:
-    """Run the study and write it beside the others."""
     parser = study.options(__doc__, seeds=8, first=20001, days=6.0)
     parser.add_argument('--kinds', default=','.join(KINDS))
     given = parser.parse_args()
-    kinds = given.kinds.split(',')
-    units = {
-        kind: study.rows_of(
-            partial(rows_of, kind=kind, days=given.days), study.seeds(given.first, given.seeds)
-        )
-        for kind in kinds
-    }
-    rows = {kind: [row for unit in units[kind] for row in unit] for kind in kinds}
-    study.keep(
-        study.name_of('reference', given.first, given.seeds),
-        summary={kind: summary_of(rows[kind]) for kind in kinds},
-        rows=[row for kind in kinds for row in rows[kind]],
-    )
+    name = study.name_of('reference', given)
+    units = itertools.product(given.kinds.split(','), study.seeds(given))
+    rows = study.rows_of(name, rows_of, units, given.days)
+    groups = study.by('kind', rows)
+    study.keep(name, summary={kind: summary(own) for kind, own in groups.items()}, rows=rows)
 
 
 if __name__ == '__main__':

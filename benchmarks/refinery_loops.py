@@ -82,24 +82,21 @@ def _run(
     """Run a loop second by second.
 
     ``process``: gain, time constant, integrating rate (0: self-regulating), delay, filter,
-    largest change of the measured value a second. ``pi``: gain, reset time, execution period.
-    ``stick``: slip-off and slip-to distance, and 1 for Kano's model. ``load`` is added to the
-    plug's opening.
+    largest change of the measured value a second. ``pi``: gain and reset time. ``stick``:
+    slip-off and slip-to distance, and 1 for Kano's model. ``load`` is added to the plug's opening.
     """
     gain, lag, integrating, delay, smooth, slew = process
     line = np.zeros(int(delay) + 1)
     plug, flow, level, seen, out = 0.0, 0.0, 0.0, 0.0, 0.0
     integral = 0.0
-    period = int(pi[2])
     memory = np.array([0.0, 0.0, 1.0, 1.0])
     for t in range(sp.size):
-        if t % period == 0:
-            error = sp[t] - seen
-            integral += pi[0] * error * period / pi[1]
-            out = pi[0] * error + integral
-            if out > 50.0 or out < -50.0:
-                integral += (50.0 if out > 0 else -50.0) - out
-                out = 50.0 if out > 0 else -50.0
+        error = sp[t] - seen
+        integral += pi[0] * error / pi[1]
+        out = pi[0] * error + integral
+        if out > 50.0 or out < -50.0:
+            integral += (50.0 if out > 0 else -50.0) - out
+            out = 50.0 if out > 0 else -50.0
         if stick[2] == 1.0:
             plug = _kano(out, plug, stick, memory)
         else:
@@ -126,8 +123,8 @@ def _process(rng: np.random.Generator, kind: str) -> FloatArray:
     return np.array([1.0, u(1, 15), rate, u(0, 10), u(1, 20), np.inf])
 
 
-def _ultimate(p: FloatArray, reset: float) -> tuple[float, float]:
-    """Return gain and frequency (rad/s) at which a loop with this reset time just oscillates."""
+def _ultimate(p: FloatArray, reset: float) -> float:
+    """Return the gain at which a loop with this reset time just oscillates."""
     w = np.geomspace(1e-5, 1.0, 4000)
     s = 1j * w
     g = p[0] / (p[1] * s + 1) * np.exp(-s * (p[3] + 1.0)) / (p[4] * s + 1)
@@ -137,7 +134,7 @@ def _ultimate(p: FloatArray, reset: float) -> tuple[float, float]:
     phase = np.unwrap(np.angle(g))
     over = np.flatnonzero(phase <= -np.pi)
     k = over[over > 0][0] if np.any(over > 0) else len(w) - 1
-    return float(1.0 / np.abs(g[k])), float(w[k])
+    return float(1.0 / np.abs(g[k]))
 
 
 def _controller(rng: np.random.Generator, p: FloatArray, tight: bool) -> FloatArray:
@@ -149,13 +146,13 @@ def _controller(rng: np.random.Generator, p: FloatArray, tight: bool) -> FloatAr
         if tight and rng.random() < 0.5:  # a reset too short for the gain swings slowly
             damping = rng.uniform(0.04, 0.15)
             gain *= rng.uniform(0.1, 0.6)
-            return np.array([gain, 4.0 * damping**2 / (gain * p[2] * p[0]), 1.0])
+            return np.array([gain, 4.0 * damping**2 / (gain * p[2] * p[0])])
     else:
         reset = max(p[1], p[4], 4.0) * rng.uniform(0.8, 2.0)
         gain = reset / (p[0] * (slow + np.exp(rng.uniform(0, 2.5)) * slow))
-    most, _ = _ultimate(p, reset)
+    most = _ultimate(p, reset)
     gain = most * rng.uniform(0.85, 0.98) if tight else min(gain, 0.5 * most)
-    return np.array([gain, reset, 1.0])
+    return np.array([gain, reset])
 
 
 def _wander(rng: np.random.Generator, n: int, memory_s: float) -> FloatArray:

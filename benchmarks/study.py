@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What every study does: take options, identify plants, go through seeds, keep the result."""
+"""What studies share: options, plants, rows over seeds, and results that are printed and kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 
+import valveflow_ros as vf
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.task import FitTask
@@ -29,6 +31,7 @@ from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import SampleTable, SpecialSegment
 
 RESULTS = Path(__file__).resolve().parent / 'results'
+PAPER = 'paper'
 T = TypeVar('T')
 
 
@@ -49,23 +52,35 @@ def command(*given: str) -> str:
     return ' '.join([f'python -m {name}', *(given or map(shlex.quote, sys.argv[1:]))])
 
 
-def rows_of(work: Callable[[Any], T], seeds: Iterable[Any]) -> list[T]:
-    """Do the work for each seed, and show what came of it as it comes."""
-    rows = []
-    for seed in seeds:
-        rows.append(work(seed))
-        print(json.dumps(finite(rows[-1])), flush=True)
+def seeds(given: argparse.Namespace) -> range:
+    return range(given.first, given.first + given.seeds)
+
+
+def name_of(kind: str, given: argparse.Namespace) -> str:
+    """Return the name of a result that has the seeds in it."""
+    return f'{kind}_{given.first}_{given.first + given.seeds - 1}'
+
+
+def rows_of(
+    name: str, work: Callable[..., dict | list[dict]], items: Iterable[Any], *more: Any
+) -> list[dict[str, Any]]:
+    """Do the work for each item; print the row or rows of each, and keep them as they come."""
+    rows: list[dict[str, Any]] = []
+    for item in items:
+        new = work(item, *more)
+        for row in [new] if isinstance(new, dict) else new:
+            rows.append(row)
+            print(json.dumps(finite(row)), flush=True)
+        keep(name, show=False, rows=rows)  # hours of work
     return rows
 
 
-def seeds(first: int, count: int) -> range:
-    """Return so many seeds."""
-    return range(first, first + count)
-
-
-def name_of(kind: str, first: int, count: int) -> str:
-    """Return the name of a result that has the seeds in it."""
-    return f'{kind}_{first}_{first + count - 1}'
+def by(key: str, rows: Iterable[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows in groups of one value of a key, in the order of their first ones."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return groups
 
 
 def finite(value: Any) -> Any:
@@ -77,17 +92,14 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def keep(name: str, strict: bool = True, folder: Path = RESULTS, **content: Any) -> Path:
-    """Write a result, headed by the command that brought it; return where it is.
-
-    Numbers that JSON does not know become null, unless it need not be ``strict`` JSON.
-    """
-    content = {'command': command(), **content}
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f'{name}.json'
-    text = json.dumps(finite(content) if strict else content, indent=1)
-    path.write_text(text + '\n', encoding='utf-8')
-    return path
+def keep(name: str, folder: Path | None = RESULTS, show: bool = True, **content: Any) -> None:
+    """Print a result without its rows; write it, headed by its command, unless folder is None."""
+    content = finite({'command': command(), **content})
+    if show:
+        print(json.dumps({k: v for k, v in content.items() if k != 'rows'}, indent=1), flush=True)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f'{name}.json').write_text(json.dumps(content, indent=1) + '\n', 'utf-8')
 
 
 def machine() -> dict[str, Any]:
@@ -131,22 +143,12 @@ def identify(unit: UnitDescription, seed: int, days: float) -> Characteristic:
     return fit(task_of(simulate(days, seed, unit).table, whole_window(unit, days))[0])
 
 
-def episodes(values: Iterable[float], limit: float = 1.0, back: float = 0.7) -> int:
-    """Count how often the size of a value passes a limit, with a return in between."""
-    count, active = 0, False
-    for value in values:
-        if not active and abs(value) > limit:
-            count, active = count + 1, True
-        elif active and abs(value) < back * limit:
-            active = False
-    return count
-
-
-def plots() -> Any:
-    """Return matplotlib's pyplot, drawing into files."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    import matplotlib.pyplot as pyplot
-
-    return pyplot
+def minute_means(
+    kind: str, number: int, seed: int, days: float, effects: Iterable[str] = ()
+) -> pd.DataFrame:
+    """Return means over a minute of the paper's unit, or of one that is built from physics."""
+    if kind != PAPER:
+        unit = f'{kind}:number={number}'
+        return vf.simulate(days, seed, effects, unit=unit, recording='minute').to_dataframe()
+    table = vf.simulate(days, seed, effects).to_dataframe().set_index('time')
+    return table.resample('60s').mean().reset_index()

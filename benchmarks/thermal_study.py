@@ -6,8 +6,7 @@ Run: ``python -m benchmarks.thermal_study --recording minute --seeds 100 --first
 is a unit of each kind of ``plant/thermal_unit.py``, drawn and run for some days. The error of a
 curve is the root mean square of its static power less the unit's at the mean weather of these
 days, over the openings and pressures visited.
-``--names`` runs a diagnosis of each healthy unit instead and counts what it names; ``--effect``
-hides an effect in each, as ``valveflow simulate --effect`` does. The limits in
+``--names`` runs a diagnosis of each healthy unit instead and counts what it names. The limits in
 ``fit/model_form.py`` were fixed on seeds 1 to 8, but for the least difference of two exponents:
 it, and the weather in the error, were set after a first look at seeds 101 to 200, and the choice
 of the form by all rows (``fit/fit.py``) after one at seeds 306, 401 to 410 and 501 to 530.
@@ -15,8 +14,10 @@ of the form by all rows (``fit/fit.py``) after one at seeds 306, 401 to 410 and 
 
 from __future__ import annotations
 
+import argparse
+import itertools
 import time
-from functools import partial
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -36,18 +37,26 @@ KINDS = {
 _EVERY = 30  # rows of the truth, s
 
 
-def curve_row(seed: int, kind: str, days: float, recording: str) -> dict[str, Any]:
+def row_of(unit: tuple[str, int], given: argparse.Namespace) -> dict[str, Any]:
+    """Simulate a unit; return what is found of its curve, or what is named."""
+    kind, seed = unit
+    simulation = vf.simulate(
+        given.days, seed, unit=f'{kind}:number={seed}', recording=given.recording
+    )
+    log, begin = simulation.log, time.process_time()
+    try:
+        found = named(log) if given.names else identified(log, simulation, kind)
+    except DataError as error:
+        found = {'refused': str(error)}
+    return {'kind': kind, 'seed': seed, **found, 'cpu_s': round(time.process_time() - begin, 1)}
+
+
+def identified(log: Any, simulation: Simulation, kind: str) -> dict[str, Any]:
     """Identify a unit; return the error of its curve and the form found."""
-    simulation = vf.simulate(days, seed, unit=f'{kind}:number={seed}', recording=recording)
     truth = simulation.data.truth
     opening, pressure = truth.plug[::_EVERY], truth.pressure[::_EVERY]
     low, middle, high = np.quantile(pressure, (0.02, 0.5, 0.98))
-    row = {'kind': kind, 'seed': seed, 'pressure_moves': round(float((high - low) / middle), 3)}
-    log, begin = simulation.log, time.process_time()
-    try:
-        found = vf.identify(log)
-    except DataError as error:
-        return {**row, 'refused': str(error)}
+    found = vf.identify(log)
     curve = found.characteristic
     static, made = simulation.static_power(opening, pressure), truth.power[::_EVERY]
     # A curve of some days is one at their weather, which makes more or less of the same steam.
@@ -56,14 +65,14 @@ def curve_row(seed: int, kind: str, days: float, recording: str) -> dict[str, An
     known = np.isfinite(error)
     form = curve.form
     return {
-        **row, 'axis': curve.axis, 'right_axis': curve.axis == KINDS[kind],
+        'pressure_moves': round(float((high - low) / middle), 3),
+        'axis': curve.axis, 'right_axis': curve.axis == KINDS[kind],
         'told': form is not None and form.told,
         'exponent': round(curve.static_form.exponent, 4), 'pieces': len(curve.pieces),
         'error_mw': round(float(np.sqrt(np.mean(error[known] ** 2))), 3),
         'weather': round(weather - 1.0, 4), 'outside': round(1.0 - float(known.mean()), 4),
         'misfit_told': found.data.misfit is not None,
         'slopes_held': slopes_held(curve, simulation, weather),
-        'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
 
 
@@ -74,8 +83,8 @@ def slopes_held(curve: Characteristic, simulation: Simulation, weather: float) -
     """
     pressure = curve.reference_pressure_mpa
     per_opening = pressure**curve.pressure_exponent
-    held = 0
     shown = curve.at_pressure().pieces
+    held = 0
     for piece in shown:
         inner = piece.u_from + np.array([0.1, 0.9]) * (piece.u_to - piece.u_from)
         power = weather * simulation.static_power(inner / per_opening, np.full(2, pressure))
@@ -84,38 +93,33 @@ def slopes_held(curve: Characteristic, simulation: Simulation, weather: float) -
     return [int(held), len(shown)]
 
 
-def name_row(
-    seed: int, kind: str, days: float, recording: str, effects: list[str]
-) -> dict[str, Any]:
+def named(log: Any) -> dict[str, Any]:
     """Diagnose a unit; return what was named."""
-    simulation = vf.simulate(
-        days, seed, effects, unit=f'{kind}:number={seed}', recording=recording
-    )
-    row = {'kind': kind, 'seed': seed}
-    log, begin = simulation.log, time.process_time()
-    try:
-        found = vf.diagnose(log).diagnosis
-    except DataError as error:
-        return {**row, 'refused': str(error)}
+    found = vf.diagnose(log).diagnosis
     return {
-        **row, 'verdict': found.verdict, 'names': [c.name for c in found.causes],
+        'verdict': found.verdict, 'names': [c.name for c in found.causes],
         'sizes': {
             c.name: {k: [e.value, e.low, e.high] for k, e in c.parameters.items()}
             for c in found.causes
         },
         'drift': found.disturbance and found.disturbance.rms_mw,
         'rmse_mw': [round(r, 3) for r in (found.rmse_simulation, found.rmse_extended)],
-        'cpu_s': round(time.process_time() - begin, 1),
     }  # fmt: skip
 
 
-def of_curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what the curves of one kind come to."""
+def summary(rows: list[dict[str, Any]], names: bool) -> dict[str, Any]:
+    """Return what the units of one kind come to."""
     done = [r for r in rows if 'refused' not in r]
+    out: dict[str, Any] = {'units': len(rows), 'refused': len(rows) - len(done)}
+    if names:
+        verdicts = Counter(r['verdict'] for r in done)
+        return out | {
+            'named': verdicts['named'], 'unexplained': verdicts['unexplained'],
+            'names': Counter(sorted(n for r in done for n in r['names'])),
+        }  # fmt: skip
     errors = [r['error_mw'] for r in done]
     worst = {'median': np.median(errors), 'p90': np.quantile(errors, 0.9), 'largest': max(errors)}
-    return {
-        'units': len(rows), 'refused': len(rows) - len(done),
+    return out | {
         'error_mw': {k: round(float(v), 3) for k, v in worst.items()},
         'right_axis': sum(r['right_axis'] for r in done), 'told': sum(r['told'] for r in done),
         'told_wrong': sum(r['told'] and not r['right_axis'] for r in done),
@@ -124,45 +128,19 @@ def of_curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def of_names(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what the diagnoses of one kind come to."""
-    done = [r for r in rows if 'refused' not in r]
-    names = sorted(n for r in done for n in r['names'])
-    return {
-        'units': len(rows), 'refused': len(rows) - len(done),
-        'named': sum(r['verdict'] == 'named' for r in done),
-        'unexplained': sum(r['verdict'] == 'unexplained' for r in done),
-        'names': {n: names.count(n) for n in dict.fromkeys(names)},
-    }  # fmt: skip
-
-
 def main() -> None:
-    """Run the study and write it beside the others."""
     parser = study.options(__doc__, seeds=10, first=101, days=8.0)
     parser.add_argument('--recording', default='1s')
     parser.add_argument('--kinds', default=','.join(KINDS))
     parser.add_argument('--names', action='store_true')
-    parser.add_argument('--effect', action='append', default=[])
     given = parser.parse_args()
-    names = given.names or bool(given.effect)
-    work, summary = (
-        (partial(name_row, effects=given.effect), of_names) if names else (curve_row, of_curves)
-    )
-    kinds = given.kinds.split(',')
-    rows = {
-        kind: study.rows_of(
-            partial(work, kind=kind, days=given.days, recording=given.recording),
-            study.seeds(given.first, given.seeds),
-        )
-        for kind in kinds
-    }
-    what = '_'.join(['names', *(e.partition(':')[0] for e in given.effect)]) if names else 'curves'
-    recording = given.recording.replace(':', '_').replace('=', '_')
-    study.keep(
-        study.name_of(f'thermal_{what}_{recording}', given.first, given.seeds),
-        summary={kind: summary(rows[kind]) for kind in kinds},
-        rows=[row for kind in kinds for row in rows[kind]],
-    )
+    what = 'names' if given.names else 'curves'
+    name = study.name_of(f'thermal_{what}_{given.recording}', given)
+    units = itertools.product(given.kinds.split(','), study.seeds(given))
+    rows = study.rows_of(name, row_of, units, given)
+    groups = study.by('kind', rows)
+    found = {kind: summary(own, given.names) for kind, own in groups.items()}
+    study.keep(name, summary=found, rows=rows)
 
 
 if __name__ == '__main__':

@@ -83,19 +83,13 @@ def interface() -> str:
 
 
 def studies() -> str:
-    """Return every study: the table of the handbook, the kept results, their pictures."""
+    """Return every study: the table of the handbook, and the kept results."""
     rows = []
     for path in sorted(page_claims.RESULTS.glob('*.json')):
         command = json.loads(path.read_text()).get('command', '')
         rows.append((f'[{path.stem}](results/{path.name})', f'`{command}`' if command else ''))
-    pictures = [
-        f'## {path.stem}\n\n![{path.stem}](results/{path.name})\n'
-        for path in sorted(page_claims.RESULTS.glob('*.png'))
-    ]
-    return '\n'.join([
-        '# Studies\n', page_claims.measured(), '## Kept results\n',
-        page_tables.table(('result', 'command'), rows), *pictures,
-    ])  # fmt: skip
+    kept = page_tables.table(('result', 'command'), rows)
+    return '\n'.join(['# Studies\n', page_claims.measured(), '## Kept results\n', kept])
 
 
 def gallery() -> str:

@@ -1,55 +1,41 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The messages read like documentation, and keep to what the tools can show."""
+"""The messages read like documentation and keep to what tools can show, as do our layouts."""
 
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import re
-from dataclasses import dataclass
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-MSG = Path(__file__).resolve().parent.parent / 'msg'
+from docs.page_tables import message
+from valveflow_ros.logs import Definitions
+from valveflow_ros.logs.mcap.definitions import parse_all
+from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
+
+ROOT = Path(__file__).resolve().parent.parent
+MSG, CONFIG = ROOT / 'msg', ROOT / 'config'
 FILES = sorted(MSG.glob('*.msg'))
 WITHOUT_HEADER = {'DiagnosisCause'}  # a part of another message
 
+# The type that each kind of value has; what is measured is a float64.
+KINDS = {
+    'text': r'string', 'time': r'builtin_interfaces/Time', 'record': r'([A-Z]|\w+/)\w+',
+    'state': r'uint8|bool', 'count': r'uint32|uint64',
+}  # fmt: skip
 UNITS = {
     '%', 'MPa', 'degC', 'MW', 'MW^2', 's', '% MPa^e', '% MPa^e / s', 'MW / (% MPa^e)', 'no unit',
 }  # fmt: skip
-KINDS = {'count', 'record', 'state', 'text', 'time'}
 # A value whose unit stands in a field beside it.
 BESIDE = re.compile(r'unit: see (field )?(\w+)')
-
-
-@dataclass(frozen=True)
-class Line:
-    """A field or constant of a message."""
-
-    type: str
-    name: str
-    value: str | None
-    unit: str
-    comment: str
-
-
-def read(path: Path) -> list[Line]:
-    """Take a message apart; every line that is no comment must be a documented field."""
-    lines = []
-    for text in path.read_text(encoding='utf-8').splitlines():
-        if not text.strip() or text.startswith('#'):
-            continue
-        found = re.fullmatch(r'(\S+) (\w+)(?:=(\S+))? +# \[([^\]]+)\] ?(.*)', text)
-        assert found, f'{path.name}: no unit in brackets behind: {text}'
-        lines.append(Line(*found.groups()))
-    return lines
-
-
-def fields(path: Path) -> list[Line]:
-    return [line for line in read(path) if line.value is None]
-
+ENDINGS = {'_mw': 'MW', '_degc': 'degC', '_per_s': '% MPa^e / s', '_s': 's'}
 
 each_file = pytest.mark.parametrize('path', FILES, ids=lambda p: p.stem)
 
@@ -60,111 +46,70 @@ def test_all_are_built():
     named = re.findall(r'\$\{root\}:msg/(\w+)\.msg', text)
     assert sorted(named) == [p.stem for p in FILES]
     assert re.findall(r':(srv/\w+\.srv)', text) == ['srv/OperateAlarm.srv']
-    assert len(FILES) == 8
 
 
 @each_file
-def test_every_line_names_its_unit(path):
-    names = {line.name for line in fields(path)}
-    for line in read(path):
-        beside = BESIDE.fullmatch(line.unit)
-        if beside:
-            assert beside[2] in names
-        else:
-            assert line.unit in UNITS | KINDS, f'{path.name}: {line.name} [{line.unit}]'
+def test_every_line_names_its_unit_and_its_type_fits(path):
+    """A text has no unit, a state is a small number, and only numbers are measured.
+
+    Arrays have no bound, because plot tools fail on bounded ones.
+    """
+    _, fields, constants = message(path)
+    lines = [line for line in path.read_text().splitlines() if line and not line.startswith('#')]
+    for line in lines:
+        assert re.fullmatch(r'\S+ \w+(=\S+)? +# \[[^\]]+\].*', line), line
+    assert len(lines) == len(fields) + len(constants)
+    names = {name for name, *_ in fields}
+    for name, kind, unit, _ in fields:
+        beside = BESIDE.fullmatch(unit)
+        assert beside[2] in names if beside else unit in UNITS | set(KINDS), name
+        scalar = kind.removesuffix('[]')
+        assert re.fullmatch(KINDS.get(unit, 'float64'), scalar), name
+        ending = next((e for e in ENDINGS if name.endswith(e)), '')
+        assert unit == ENDINGS.get(ending, unit), name
 
 
 @each_file
-def test_the_kind_fits_the_type(path):
-    """A text has no unit, a state is a small number, and only numbers are measured."""
-    for line in read(path):
-        scalar = line.type.removesuffix('[]')
-        if line.unit == 'text':
-            assert scalar == 'string'
-        elif line.unit == 'time':
-            assert scalar == 'builtin_interfaces/Time'
-        elif line.unit == 'record':
-            assert scalar[0].isupper() or '/' in scalar
-        elif line.unit == 'state':
-            assert scalar in ('uint8', 'bool')
-        elif line.unit == 'count':
-            assert scalar in ('uint32', 'uint64')
-        else:
-            assert scalar == 'float64', f'{path.name}: {line.name}'
+def test_states_and_what_is_not_known_are_explained(path):
+    """Every number that stands for a state has constants that name all it can be.
 
-
-@each_file
-def test_names_end_in_the_unit_they_carry(path):
-    """A name that carries a unit carries the right one."""
-    endings = {'_mw': 'MW', '_degc': 'degC', '_s': 's', '_per_s': '% MPa^e / s'}
-    for line in fields(path):
-        for ending in sorted(endings, key=len, reverse=True):
-            if line.name.endswith(ending):
-                assert line.unit == endings[ending], f'{path.name}: {line.name}'
-                break
-
-
-@each_file
-def test_states_are_named_by_constants(path):
-    """Every number that stands for a state has constants that name all it can be."""
-    constants = [line for line in read(path) if line.value is not None]
-    states = [line for line in fields(path) if line.unit == 'state' and line.type == 'uint8']
-    assert bool(constants) == bool(states)
-    assert all(line.type == 'uint8' for line in constants)
-    assert len({line.name for line in constants}) == len(constants)
-    assert all(line.comment for line in constants)
-
-
-@each_file
-def test_header_first(path):
-    first = fields(path)[0]
-    if path.stem in WITHOUT_HEADER:
-        assert all('Header' not in line.type for line in fields(path))
-    else:
-        assert (first.type, first.name) == ('std_msgs/Header', 'header')
-        assert 'stamp:' in first.comment
-        assert 'frame_id:' in first.comment
-
-
-@each_file
-def test_what_unknown_looks_like_is_said(path):
-    """The message says somewhere what stands for a number or text that is not there."""
+    The message says somewhere what stands for a number or text that is not there.
+    """
+    _, fields, constants = message(path)
     text = path.read_text(encoding='utf-8')
-    types = {line.type for line in fields(path)}
-    if 'float64' in types:
-        assert 'NaN' in text
-    for line in fields(path):
-        if line.name == 'model_id' or line.name.startswith('not_'):
-            assert 'empty:' in line.comment
-
-
-@each_file
-def test_arrays_have_no_bound(path):
-    """Plot tools fail on bounded ones."""
-    for line in fields(path):
-        assert re.fullmatch(r'[\w/]+(\[\])?', line.type), f'{path.name}: {line.type}'
+    states = [name for name, kind, unit, _ in fields if (kind, unit) == ('uint8', 'state')]
+    assert bool(constants) == bool(states)
+    assert len({name for name, _, _ in constants}) == len(constants)
+    assert all(meaning for _, _, meaning in constants)
+    assert 'NaN' in text or all(kind != 'float64' for _, kind, _, _ in fields)
+    for name, _, _, meaning in fields:
+        assert 'empty:' in meaning or not (name == 'model_id' or name.startswith('not_'))
 
 
 @each_file
 def test_text_form(path):
+    _, fields, _ = message(path)
     text = path.read_text(encoding='utf-8')
-    assert text.startswith('# ')
-    assert text.endswith('\n')
-    assert not text.endswith('\n\n')
+    assert re.fullmatch(r'# .*[^\n]\n', text, re.S)
     assert text.isascii()
     assert '\t' not in text
     assert max(map(len, text.splitlines())) <= 112
+    name, kind, _, meaning = fields[0]
+    if path.stem in WITHOUT_HEADER:
+        assert 'Header' not in text
+    else:
+        assert (kind, name) == ('std_msgs/Header', 'header')
+        assert re.search('stamp:.*frame_id:', meaning)
 
 
-def message_class(name: str) -> type:
+def built(module: str, name: str) -> Any:
     """The built class, or a skip where the package is not built."""
     try:
-        module = importlib.import_module('valveflow_msgs.msg')
+        return getattr(importlib.import_module(module), name)
     except ImportError as error:
         if os.environ.get('VALVEFLOW_REQUIRE_ROS'):
             raise
         pytest.skip(f'valveflow_msgs is not built here ({error}); run make setup')
-    return getattr(module, name)
 
 
 def test_the_service_answers_as_a_trigger_does_and_is_built_as_written():
@@ -176,38 +121,169 @@ def test_the_service_answers_as_a_trigger_does_and_is_built_as_written():
     assert parts == [
         [('string', 'name'), ('string', 'action')], [('bool', 'success'), ('string', 'message')]
     ]  # fmt: skip
-    try:
-        kind = importlib.import_module('valveflow_msgs.srv').OperateAlarm
-    except ImportError as error:
-        if os.environ.get('VALVEFLOW_REQUIRE_ROS'):
-            raise
-        pytest.skip(f'valveflow_msgs is not built here ({error}); run make setup')
-    built = (kind.Request, kind.Response)
-    assert [list(b.get_fields_and_field_types()) for b in built] == [
-        [name for _, name in part] for part in parts
-    ]
+    kind = built('valveflow_msgs.srv', 'OperateAlarm')
+    for half, part in zip((kind.Request, kind.Response), parts, strict=True):
+        assert list(half.get_fields_and_field_types()) == [name for _, name in part]
 
 
 @each_file
 def test_each_type_is_built_as_written(path):
     """The built class has the fields, constants and no others, and starts empty."""
-    cls = message_class(path.stem)
-    built = cls.get_fields_and_field_types()
-    assert list(built) == [line.name for line in fields(path)]
-    for line in read(path):
-        if line.value is not None:
-            assert getattr(cls, line.name) == int(line.value)
-    message = cls()
-    assert all(len(getattr(message, f.name)) == 0 for f in fields(path) if f.type.endswith('[]'))
+    cls = built('valveflow_msgs.msg', path.stem)
+    _, fields, constants = message(path)
+    assert list(cls.get_fields_and_field_types()) == [name for name, *_ in fields]
+    assert {name: getattr(cls, name) for name, _, _ in constants} == {
+        name: int(value) for name, value, _ in constants
+    }
+    assert all(len(getattr(cls(), f[0])) == 0 for f in fields if f[1].endswith('[]'))
 
 
 def test_values_survive_the_wire():
     """Filled messages come back equal after a round trip through CDR."""
-    cause_type, diagnosis_type = message_class('DiagnosisCause'), message_class('Diagnosis')
+    cause_type, diagnosis_type = (
+        built('valveflow_msgs.msg', name) for name in ('DiagnosisCause', 'Diagnosis')
+    )
     serialization = importlib.import_module('rclpy.serialization')
     cause = cause_type(name='sticking', parameter_names=['width'], parameter_values=[0.5])
-    message = diagnosis_type(causes=[cause, cause], verdict=diagnosis_type.NAMED)
-    message.header.frame_id = 'unit 1'
-    data = serialization.serialize_message(message)
-    assert serialization.deserialize_message(data, diagnosis_type) == message
-    assert serialization.deserialize_message(data, diagnosis_type).causes[1].name == 'sticking'
+    sent = diagnosis_type(causes=[cause, cause], verdict=diagnosis_type.NAMED)
+    sent.header.frame_id = 'unit 1'
+    data = serialization.serialize_message(sent)
+    assert serialization.deserialize_message(data, diagnosis_type) == sent
+
+
+# --- the layouts for Foxglove and PlotJuggler ------------------------------------------------
+
+NODE = '/valveflow_monitor'
+TYPES = {
+    'characteristic': 'valveflow_msgs/msg/FlowCharacteristic',
+    'prediction': 'valveflow_msgs/msg/Prediction',
+    'alarms': 'valveflow_msgs/msg/Alarm',
+    'diagnosis': 'valveflow_msgs/msg/Diagnosis',
+}
+NUMBERS = {'bool', 'uint8', 'uint32', 'uint64', 'float64', 'int32'}
+# A topic, a filter on it, then fields with slices.
+PATH = re.compile(
+    rf'{NODE}/(?P<topic>\w+)(?:\{{(?P<filter>\w+)==[^}}]+\}})?(?P<fields>(?:\.\w+(?:\[[0-9:]*\])?)*)\Z'
+)
+
+
+def found(topic: str, *steps: str) -> str:
+    """Return the type of the field that a path of names leads to; an array is sliced."""
+    types = parse_all(TYPES[topic], Definitions([]).text(TYPES[topic]))
+    kind = TYPES[topic]
+    for step in steps:
+        fields = {f.name: f for f in types[kind]}
+        name = step.partition('[')[0]
+        assert name in fields, f'{topic} has no field {name}'
+        assert bool(fields[name].array) == ('[' in step), f'{topic}.{step}'
+        kind = fields[name].type
+    return kind
+
+
+def resolved(path: str) -> str:
+    match = PATH.match(path)
+    assert match, f'{path} is no path of a topic of ours'
+    if match['filter']:
+        assert found(match['topic'], match['filter']) == 'string'
+    return found(match['topic'], *match['fields'].split('.')[1:])
+
+
+@pytest.fixture(scope='module')
+def foxglove() -> dict[str, Any]:
+    return dict(json.loads((CONFIG / 'foxglove_layout.json').read_text()))
+
+
+@pytest.fixture(scope='module')
+def plotjuggler() -> ET.Element:
+    return ET.parse(CONFIG / 'plotjuggler_layout.xml').getroot()
+
+
+def leaves(node: Any) -> Iterator[str]:
+    if isinstance(node, str):
+        yield node
+        return
+    assert node['direction'] in ('row', 'column')
+    assert 0 < node['splitPercentage'] < 100
+    yield from leaves(node['first'])
+    yield from leaves(node['second'])
+
+
+def test_every_panel_of_foxglove_is_shown_once_and_known(foxglove):
+    shown = list(leaves(foxglove['layout']))
+    panels = foxglove['configById']
+    assert sorted(shown) == sorted(panels)
+    kinds = {'Plot', 'StateTransitions', 'RawMessages', 'DiagnosticSummary', 'Table'}
+    assert {name.split('!')[0] for name in shown} == kinds
+    for panel in panels.values():
+        assert panel['foxglovePanelTitle'] == panel['lichtblickPanelTitle']
+        # A replay has stamps of another day; over those its plots would be empty.
+        assert {p['timestampMethod'] for p in panel.get('paths', ())} <= {'receiveTime'}
+    curve = panels['Plot!curve']
+    assert curve['xAxisVal'] == 'currentCustom'
+    assert curve['xAxisPath']['value'].startswith(f'{NODE}/characteristic.')
+
+
+def test_every_path_of_foxglove_leads_to_a_field(foxglove):
+    plotted = set()
+    for name, panel in foxglove['configById'].items():
+        assert panel.get('topicToRender') in (None, '/diagnostics')
+        if panel.get('topicPath'):
+            resolved(panel['topicPath'])
+        for path in [*panel.get('paths', ()), *filter(None, [panel.get('xAxisPath')])]:
+            try:
+                float(path['value'])  # a reference line
+            except ValueError:
+                assert resolved(path['value']) in NUMBERS, name
+                plotted.add(path['value'].removeprefix(f'{NODE}/'))
+    wanted = (
+        'characteristic.values[:]', 'characteristic.breakpoints[:]', 'prediction.measured_mw',
+        'prediction.dynamic_mw', 'prediction.residual_mw', 'prediction.limit_low_mw',
+        'prediction.limit_high_mw', 'diagnosis.verdict',
+    )  # fmt: skip
+    assert set(wanted) <= plotted
+    named = set(re.findall(r'name==\\"([^"\\]+)\\"', json.dumps(foxglove)))
+    assert named == {ResidualAlarm.NAME, ShiftAlarm.NAME}
+
+
+def test_every_series_of_plotjuggler_is_a_number_of_a_message(plotjuggler):
+    curves = plotjuggler.findall(".//plot[@mode='TimeSeries']/curve")
+    names = {curve.attrib['name'] for curve in curves}
+    assert {f'{NODE}/prediction/measured_mw', f'{NODE}/diagnosis/verdict'} <= names
+    for name in names:
+        assert found(*name.removeprefix(f'{NODE}/').split('/', 1)) in NUMBERS, name
+    # It drops NaN, and then refuses to pair two series that do not have the same times.
+    assert all('curve_x' not in curve.attrib for curve in plotjuggler.iter('curve'))
+
+
+def test_the_script_of_plotjuggler_draws_the_curve_of_the_message(plotjuggler):
+    (script,) = plotjuggler.iter('script')
+    code = script.attrib['global']
+    made = set(re.findall(r'ScatterXY\.new\("([^"]+)"\)', code))
+    drawn = [c.attrib['name'] for c in plotjuggler.iterfind(".//plot[@mode='XYPlot']/curve")]
+    assert sorted(drawn) == sorted(made)
+    for topic, fields in (
+        ('characteristic', ('breakpoints[]', 'values[]', 'pieces')),
+        ('prediction', ('integrated_input', 'measured_mw')),
+    ):
+        assert f'"{NODE}/{topic}"' in code
+        for field in fields:
+            assert f'/{field.removesuffix("[]")}' in code
+            found(topic, field)
+
+
+def test_sizes_and_topics_of_plotjuggler_add_up(plotjuggler):
+    for splitter in plotjuggler.iter('DockSplitter'):
+        sizes = [float(part) for part in splitter.attrib['sizes'].split(';')]
+        assert len(sizes) == int(splitter.attrib['count']) == len(splitter.findall('DockArea'))
+        assert sum(sizes) == pytest.approx(1.0)
+    wanted = ';'.join(f'{NODE}/{topic}' for topic in TYPES)
+    plugins = {p.attrib['ID']: p for p in plotjuggler.iter('plugin')}
+    assert plugins['DataLoad MCAP'][0].attrib['selected_topics'] == wanted
+    subscriber = plugins['ROS2 Topic Subscriber'].find('selected_topics')
+    assert subscriber.attrib['value'] == wanted
+
+
+@pytest.mark.ros
+def test_the_topics_of_the_layouts_are_those_of_the_node():
+    outputs = pytest.importorskip('valveflow_ros.ros.node.outputs').OUTPUTS
+    assert {name: outputs[name].type_name for name in TYPES} == TYPES

@@ -1,10 +1,17 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
+"""Work on several cores, and compiled code: used again while nothing that it is of changes."""
+
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import pytest
+from streams import needs_jit
 
 from valveflow_ros import numerics
 from valveflow_ros.numerics import read_ahead, run_in_threads
@@ -31,13 +38,10 @@ def numbers(n, seen, wrong_at=None):
         yield k
 
 
-def test_items_made_ahead_are_the_same_in_the_same_order(on_cores):
+def test_items_made_ahead_are_the_same_in_the_same_order_up_to_an_error(on_cores):
     seen = []
     assert list(read_ahead(numbers(50, seen))) == list(range(50))
     assert (threading.current_thread() in seen) == (on_cores == 1)
-
-
-def test_an_error_comes_behind_what_was_made_before_it(on_cores):
     items = read_ahead(numbers(50, [], wrong_at=5))
     assert [next(items) for _ in range(5)] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match='number 5'):
@@ -59,16 +63,13 @@ def test_no_more_is_made_ahead_than_asked_for_and_who_stops_early_ends_the_threa
     assert len(seen) <= 8
 
 
-def test_every_task_is_done_once_whatever_the_threads():
-    for count in (1, 2, 7):
-        done, lock = [], threading.Lock()
-
-        def work(k, done=done, lock=lock):
-            with lock:
-                done.append(k)
-
-        run_in_threads(work, [(k,) for k in range(20)], count)
-        assert sorted(done) == list(range(20))
+@pytest.mark.parametrize('count', [1, 2, 7])
+def test_every_task_is_done_once_and_an_error_is_raised(count):
+    done = []
+    run_in_threads(done.append, [(k,) for k in range(20)], count)
+    assert sorted(done) == list(range(20))
+    with pytest.raises(ValueError, match='seven'):
+        run_in_threads(lambda k: int('seven') if k == 7 else None, [(k,) for k in range(9)], count)
 
 
 def test_no_thread_is_started_for_which_there_is_no_task():
@@ -77,6 +78,56 @@ def test_no_thread_is_started_for_which_there_is_no_task():
     assert names == {threading.current_thread()}
 
 
-def test_the_error_of_a_task_is_raised():
-    with pytest.raises(ValueError, match='seven'):
-        run_in_threads(lambda k: int('seven') if k == 7 else None, [(k,) for k in range(9)], 3)
+# --- compiled code ---------------------------------------------------------------------------
+
+INNER = """
+from valveflow_ros.numerics import inlined
+
+@inlined
+def step(x):
+    return x + {step}
+"""
+OUTER = """
+from typing import NamedTuple
+import numpy as np
+from inner import step
+from valveflow_ros.numerics import jit
+
+class {name}(NamedTuple):
+    x: np.ndarray
+
+@jit
+def run(state):
+    return step(state.x[0])
+
+print(run({name}(np.ones(1))), sum(run.stats.cache_hits.values()))
+"""
+
+
+def write(path: Path, text: str, at_s: float) -> None:
+    path.write_text(text)
+    os.utime(path, (at_s, at_s))
+
+
+def run(folder: Path) -> list[str]:
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(folder / 'cache')}
+    done = subprocess.run(
+        [sys.executable, '-B', '-c', 'import outer'], cwd=folder, env=environment,
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return done.stdout.split()
+
+
+@needs_jit
+def test_what_was_compiled_is_used_again_while_nothing_that_it_is_made_of_has_changed(tmp_path):
+    inner, outer = tmp_path / 'inner.py', tmp_path / 'outer.py'
+    write(inner, INNER.format(step=1.0), 1e9)
+    write(outer, OUTER.format(name='State'), 1e9)
+    assert run(tmp_path) == ['2.0', '0']
+    os.utime(inner, (4e9, 4e9))
+    assert run(tmp_path) == ['2.0', '1'], 'it is kept, although a file is from the future'
+    inner.write_text(INNER.format(step=5.0))
+    assert run(tmp_path) == ['6.0', '0'], 'a file that is called has changed'
+    write(outer, OUTER.format(name='Renamed'), 2e9)
+    assert run(tmp_path)[0] == '6.0', 'a type of another name is no error'
+    assert run(tmp_path) == ['6.0', '1']

@@ -65,28 +65,20 @@ def entries():
     return found
 
 
-def test_one_version():
-    versions = {manifest('.').findtext('version'), manifest('msg').findtext('version')}
-    assert versions == {valveflow_ros.__version__}
-
-
 @pytest.mark.parametrize('folder', ['.', 'msg'])
 def test_manifests(folder):
     """colcon takes a package whose mail address it cannot read for something else."""
     root = manifest(folder)
-    assert root.get('format') == '3'
-    assert root.findtext('license') == 'Apache-2.0'
+    assert (root.get('format'), root.findtext('license')) == ('3', 'Apache-2.0')
+    assert root.findtext('version') == valveflow_ros.__version__
     assert re.fullmatch(r'[\w.]+@[\w.]+\.\w+', root.find('maintainer').get('email'))
-    assert root.findtext('maintainer')
     assert root.findtext('url').startswith('https://')
-    assert root.findtext('description')
-
-
-def test_licence_text():
+    assert all(root.findtext(name) for name in ('maintainer', 'description'))
+    # As rosdep resolves them on Ubuntu 24.04: by apt. Those resolved by pip are refused there.
+    assert keys(folder) - {'valveflow_msgs'} <= NATIVE
     text = (ROOT / 'LICENSE').read_text(encoding='utf-8')
-    assert 'Apache License' in text
-    assert 'Version 2.0, January 2004' in text
-    assert 'END OF TERMS AND CONDITIONS' in text
+    for words in ('Apache License', 'Version 2.0, January 2004', 'END OF TERMS AND CONDITIONS'):
+        assert words in text
 
 
 def test_executables_are_those_of_the_contract(arguments):
@@ -101,24 +93,24 @@ def test_executables_are_those_of_the_contract(arguments):
         assert callable(getattr(importlib.import_module(module), name))
 
 
-def test_every_package_is_shipped(arguments):
+def test_packages_and_data_files_are_shipped(arguments):
     """A folder with Python files and without __init__.py would be left behind."""
     folders = {p.parent for p in (ROOT / 'valveflow_ros').rglob('*.py')}
-    assert {str(p.relative_to(ROOT)).replace('/', '.') for p in folders} == set(
-        arguments['packages']
-    )
-
-
-def test_data_files_exist(arguments):
+    named = {str(p.relative_to(ROOT)).replace('/', '.') for p in folders}
+    assert named == set(arguments['packages'])
     targets = dict(arguments['data_files'])
     assert targets['share/ament_index/resource_index/packages'] == ['resource/valveflow_ros']
     assert targets['share/valveflow_ros'] == ['package.xml']
     assert len(targets['share/valveflow_ros/msg']) == len(list((ROOT / 'msg').glob('*.msg')))
+    config = set(targets['share/valveflow_ros/config'])
+    assert {f'config/{name}_layout.{kind}' for name, kind in LAYOUTS} <= config
     for files in targets.values():
         assert all((ROOT / name).is_file() for name in files)
+    # colcon asks for it; without pytest in it, it would run unittest and find nothing.
+    assert 'pytest' in arguments['extras_require']['test']
 
 
-# As rosdep resolves them on Ubuntu 24.04: by apt. Those resolved by pip are refused there.
+LAYOUTS = (('foxglove', 'json'), ('plotjuggler', 'xml'))
 NATIVE = {
     'ament_cmake', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch',
     'launch_ros', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'rosgraph_msgs',
@@ -132,11 +124,6 @@ NATIVE = {
 def keys(folder):
     """The names of all dependencies of a package."""
     return {e.text for e in manifest(folder).iter() if e.tag.endswith('depend')}
-
-
-@pytest.mark.parametrize('folder', ['.', 'msg'])
-def test_rosdep_needs_no_pip(folder):
-    assert keys(folder) - {'valveflow_msgs'} <= NATIVE
 
 
 def imports(path, everywhere):
@@ -199,10 +186,8 @@ def test_a_build_without_the_messages_says_so(tmp_path, word):
     marker.parent.mkdir(parents=True)
     marker.touch()
     assert 'valveflow_msgs' not in run_setup(tmp_path, word, '--help')
-
-
-def test_a_wheel_is_built_without_a_word_about_messages(tmp_path):
-    assert 'valveflow_msgs' not in run_setup(tmp_path, 'bdist_wheel', '--help')
+    # A wheel needs none.
+    assert 'valveflow_msgs' not in run_setup('/nowhere', 'bdist_wheel', '--help')
 
 
 def without(module, code):
@@ -214,39 +199,27 @@ def without(module, code):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    'name', ['monitor', 'opcua_gateway', 'page', 'plant_simulator', 'replay', 'watch']
-)
-def test_a_node_without_the_messages_names_the_command(name):
-    code = f'import valveflow_ros.ros\nsys.exit(valveflow_ros.ros.{name}())'
-    done = without('valveflow_msgs', code)
-    assert done.returncode == 1
-    assert done.stderr == (
-        f'valveflow {name}: The message package valveflow_msgs is not found. In the workspace: '
-        'colcon build --base-paths src src/valveflow_ros/msg, then source install/setup.bash.\n'
-    )
+def test_a_node_without_the_messages_names_the_command():
+    """All of them begin with the same check."""
+    for name in ('monitor', 'page'):
+        done = without('valveflow_msgs', f'from valveflow_ros import ros\nsys.exit(ros.{name}())')
+        assert (done.returncode, done.stderr) == (
+            1,
+            f'valveflow {name}: The message package valveflow_msgs is not found. In the workspace:'
+            ' colcon build --base-paths src src/valveflow_ros/msg, then source install/setup.bash.'
+            '\n',
+        )
 
 
 def test_without_mcap_a_log_is_refused_in_words():
     """No rosdep key brings it."""
     code = "from valveflow_ros.cli.main import main\nsys.exit(main(['info', 'README.md']))"
     done = without('mcap', code)
-    assert done.returncode == 1
+    assert (done.returncode, done.stderr.count('\n')) == (1, 1)
     assert done.stderr.endswith('which is not installed: pip install mcap.\n')
-    assert done.stderr.count('\n') == 1
 
 
-def test_colcon_runs_the_tests_by_pytest(arguments):
-    """It asks the extra `test`; without pytest in it, it would run unittest and find nothing."""
-    assert 'pytest' in arguments['extras_require']['test']
-
-
-def test_no_linter_is_configured_that_is_not_run():
-    text = (ROOT / 'setup.cfg').read_text(encoding='utf-8')
-    assert set(re.findall(r'^\[(.*)\]', text, re.M)) == {'develop', 'install'}
-
-
-def test_the_tree_of_other_versions(monkeypatch, tmp_path):
+def test_the_tree_of_other_versions(monkeypatch, tmp_path, capsys):
     """It is the files of the checkout, without those deleted there; its set-up is kept."""
     root, copy = tmp_path / 'root', tmp_path / 'copy'
     (root / 'a').mkdir(parents=True)
@@ -263,13 +236,12 @@ def test_the_tree_of_other_versions(monkeypatch, tmp_path):
     versions.copy_tree(copy)
     assert {p.name for p in copy.iterdir()} == {'.venv', 'a', 'new.py'}
     assert (copy / 'a' / 'kept.py').read_text() == 'a/kept.py'
+    assert versions.main('/nowhere/python3.12') == 1
+    assert capsys.readouterr().err == 'setup: /nowhere/python3.12: No such file or directory\n'
 
 
-def test_every_source_file_names_copyright_and_licence():
+def test_every_source_file_names_copyright_and_licence_once(monkeypatch, tmp_path, capsys):
     assert headers.lacking() == [], 'run: python tools/headers.py'
-
-
-def test_headers_are_added_once(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(headers, 'ROOT', tmp_path)
     files = {
         'setup.py': '"""About."""\n', 'env.sh': '# About.\n', 'msg/CMakeLists.txt': 'project(x)\n',
@@ -291,36 +263,26 @@ def test_headers_are_added_once(monkeypatch, tmp_path, capsys):
     assert capsys.readouterr().out == '0 files changed\n'
 
 
-def test_a_python_that_is_not_there_is_named(capsys):
-    assert versions.main('/nowhere/python3.12') == 1
-    assert capsys.readouterr().err == 'setup: /nowhere/python3.12: No such file or directory\n'
-
-
 def test_the_oldest_libraries_are_those_that_are_tested(arguments):
     oldest = dict(re.findall(r'^(\w+)==(\d+\.\d+)', '\n'.join(versions.UBUNTU['3.12']), re.M))
-    for name, version in oldest.items():
-        assert f'{name}>={version}' in arguments['install_requires']
+    assert set(oldest) == {'numpy', 'scipy', 'pandas', 'numba'}
+    assert {f'{name}>={version}' for name, version in oldest.items()} <= set(
+        arguments['install_requires']
+    )
 
 
-def test_what_pip_installs_is_in_the_lock(arguments):
+def test_the_lock_holds_what_is_wanted(arguments):
     names = {NAME.match(requirement)[0] for requirement in arguments['install_requires']}
-    assert names <= wanted()
+    assert names <= wanted() <= set(entries()), 'requirements.in has changed; run make lock'
     assert not any(name.startswith('ros') for name in names), 'pip install must work without ROS'
-
-
-def test_the_lock_holds_what_is_wanted():
-    assert wanted() <= set(entries()), 'requirements.in has changed; run make lock'
 
 
 @pytest.mark.parametrize('version', ['3.10', '3.11', '3.12'])
 def test_one_version_of_each_for_every_python(version):
     """The markers of a name's entries do not overlap, and one of them fits."""
     markers = pytest.importorskip('packaging.markers')
-    env = {
-        'python_version': version,
-        'python_full_version': f'{version}.5',
-        'sys_platform': 'linux',
-    }
+    env = {'python_version': version, 'python_full_version': f'{version}.5',
+           'sys_platform': 'linux'}  # fmt: skip
     for name, texts in entries().items():
         found = [re.match(r'\S+( ; (.*))? \\', text)[2] for text in texts]
         fits = [m for m in found if m is None or markers.Marker(m).evaluate(env)]
@@ -351,16 +313,11 @@ def test_no_dependency_asks_for_a_gpl(arguments):
     assert len(found) >= len(arguments['install_requires'])
     for name, distribution in found.items():
         metadata = distribution.metadata
-        stated = [
-            metadata.get('License-Expression') or '',
-            *(metadata.get_all('Classifier') or []),
-        ]
-        licences = [text for text in stated if 'License' in text or text == stated[0]]
+        classes = [c for c in metadata.get_all('Classifier') or [] if 'License' in c]
+        stated = ' '.join([metadata.get('License-Expression') or '', *classes])
         # Compilers' run-time libraries inside wheels come with an exception that allows it.
-        text = re.sub(
-            r'GPL-[\d.]+(-or-later)? ?(WITH |-with-)GCC-exception\S*', '', ' '.join(licences)
-        )
-        assert 'GPL' not in text, f'{name}: {text}'
+        allowed = r'GPL-[\d.]+(-or-later)? ?(WITH |-with-)GCC-exception\S*'
+        assert 'GPL' not in re.sub(allowed, '', stated), f'{name}: {stated}'
 
 
 def test_the_wheel_of_the_pure_part(tmp_path):
@@ -374,18 +331,10 @@ def test_the_wheel_of_the_pure_part(tmp_path):
             shutil.copytree(ROOT / name, tree / name, ignore=ignore)
     for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'README.md', 'LICENSE'):
         shutil.copy(ROOT / name, tree)
-    command = [
-        sys.executable,
-        '-m',
-        'pip',
-        'wheel',
-        '--no-deps',
-        '--no-build-isolation',
-        '--no-index',
-    ]
+    command = [sys.executable, '-m', 'pip', 'wheel', '--no-deps', '--no-build-isolation']
     done = subprocess.run(
-        [*command, '-w', tmp_path, tree], capture_output=True, text=True, check=False
-    )
+        [*command, '--no-index', '-w', tmp_path, tree], capture_output=True, text=True, check=False
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     wheel = next(tmp_path.glob('*.whl'))
     with zipfile.ZipFile(wheel) as archive:
@@ -396,18 +345,14 @@ def test_the_wheel_of_the_pure_part(tmp_path):
     assert {n.split('/')[0] for n in names} == {
         'valveflow_ros', f'valveflow_ros-{version}.data', f'valveflow_ros-{version}.dist-info',
     }  # fmt: skip
-    files = {
-        str(path.relative_to(ROOT))
-        for path in (ROOT / 'valveflow_ros').rglob('*')
-        if path.is_file() and '__pycache__' not in path.parts
-    }
-    assert {n for n in names if n.startswith('valveflow_ros/')} == files
+    files = (p for p in (ROOT / 'valveflow_ros').rglob('*') if '__pycache__' not in p.parts)
+    shipped = {str(path.relative_to(ROOT)) for path in files if path.is_file()}
+    assert {n for n in names if n.startswith('valveflow_ros/')} == shipped
     share = f'valveflow_ros-{version}.data/data/share'
     assert f'{share}/ament_index/resource_index/packages/valveflow_ros' in names
     assert f'{share}/valveflow_ros/msg/Alarm.msg' in names
-    points = (
-        tmp_path / 'out' / f'valveflow_ros-{version}.dist-info' / 'entry_points.txt'
-    ).read_text()
+    about = tmp_path / 'out' / f'valveflow_ros-{version}.dist-info'
+    points = (about / 'entry_points.txt').read_text()
     assert points.strip() == '[console_scripts]\nvalveflow = valveflow_ros.cli.main:main'
     loaded = subprocess.run(
         [sys.executable, '-c', 'import valveflow_ros; print(valveflow_ros.__file__)'],

@@ -51,6 +51,33 @@ def answers(folder: Path, method: str) -> dict[str, Any]:
     return found
 
 
+def keep(folder: Path, truth: dict[str, Any]) -> None:
+    """Answer the sealed set with every method and keep the scores."""
+    said = {method: answers(folder, method) for method in METHODS}
+    study.keep(
+        'naming', command=study.command('study', 'DIR'), first_seed=records.SEALED,
+        days=records.DAYS, truth_sha256=records.sha256(folder),
+        published=records.same_as_published(folder, records.SEALED),
+        summary={method: scoring.score(truth, said[method]) for method in METHODS},
+        rows=[{'record': r, **t, 'answers': {m: said[m][r] for m in METHODS}}
+              for r, t in truth.items()],
+    )  # fmt: skip
+
+
+def run(given: argparse.Namespace) -> None:
+    folder: Path = given.folder
+    if given.verb in ('make', 'study'):
+        practice = given.verb == 'make' and given.practice
+        make(folder, records.PRACTICE if practice else records.SEALED)
+    if given.verb == 'answer':
+        answers(folder, given.method)
+    elif given.verb == 'score':
+        scored = scoring.score(scoring.read(folder / 'truth.json'), scoring.read(given.answers))
+        print(scoring.words(scored))
+    elif given.verb == 'study':
+        keep(folder, scoring.read(folder / 'truth.json'))
+
+
 def main() -> int:
     """Run a verb; return the exit status."""
     parser = study.options(__doc__)
@@ -66,30 +93,6 @@ def main() -> int:
         print(f'naming: {error}', file=sys.stderr)
         return 1
     return 0
-
-
-def run(given: argparse.Namespace) -> None:
-    """Do what is asked."""
-    folder = given.folder
-    if given.verb == 'make':
-        make(folder, records.PRACTICE if given.practice else records.SEALED)
-    elif given.verb == 'answer':
-        answers(folder, given.method)
-    elif given.verb == 'score':
-        truth = scoring.read(folder / 'truth.json')
-        print(scoring.words(scoring.score(truth, scoring.read(given.answers))))
-    else:
-        make(folder, records.SEALED)
-        truth = scoring.read(folder / 'truth.json')
-        said = {method: answers(folder, method) for method in METHODS}
-        study.keep(
-            'naming', command=study.command('study', 'DIR'), first_seed=records.SEALED,
-            days=records.DAYS, truth_sha256=records.sha256(folder),
-            published=records.same_as_published(folder, records.SEALED),
-            summary={method: scoring.score(truth, said[method]) for method in METHODS},
-            rows=[{'record': r, **t, 'answers': {m: said[m][r] for m in METHODS}}
-                  for r, t in truth.items()],
-        )  # fmt: skip
 
 
 if __name__ == '__main__':

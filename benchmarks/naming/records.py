@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 import valveflow_ros as vf
-from benchmarks.diagnosis_cases import EFFECTS, Setting, hidden, null, outside, slow
+from benchmarks.diagnosis_cases import EFFECTS, Setting, drawn, hidden, null, outside, slow
 from benchmarks.diagnosis_outside import OUTSIDE, SLOW, slowly
 from benchmarks.diagnosis_study import simulated
 from valveflow_ros.errors import RecordingError
@@ -71,11 +71,16 @@ def entries(first: int) -> list[Entry]:
     rng = np.random.default_rng([first, 1])
     for (plant, recording), names in HIDDEN.items():
         outer = (*OUTSIDE, *_SLOW) if (plant, recording) == ('paper', '1s') else _SLOW
-        drawn = rng.choice(np.array(outer), _OUTSIDE, replace=False).tolist()
-        rest = [('healthy', '')] * _HEALTHY + [('outside', label) for label in drawn]
+        labels = rng.choice(np.array(outer), _OUTSIDE, replace=False).tolist()
+        rest = [('healthy', '')] * _HEALTHY + [('outside', label) for label in labels]
         found += [(plant, recording, *what) for what in [('hidden', n) for n in names] + rest]
     ordered = [Entry(first + k, *what) for k, what in enumerate(found)]
     return [ordered[k] for k in rng.permutation(len(ordered))]
+
+
+def kind_of(entry: Entry) -> str:
+    """Draw the kind of the valves of a unit built from physics."""
+    return str(np.random.default_rng([entry.seed, 2]).choice(np.array(list(KINDS))))
 
 
 def record(entry: Entry, days: float) -> tuple[pd.DataFrame, tuple[EffectSpec, ...]]:
@@ -111,7 +116,7 @@ def _physics(entry: Entry, days: float) -> tuple[Simulation, tuple[EffectSpec, .
     effects: tuple[EffectSpec, ...] = ()
     if entry.kind == 'hidden':
         setting = Setting(rng, UnitDescription(), days, *TIMES)
-        effects = (EffectSpec.parse(EFFECTS[entry.label](setting)),)
+        effects = (drawn(entry.label, setting),)
     simulation = vf.simulate(days, entry.seed, effects, unit=f'{kind}:number={entry.seed}')
     if entry.kind == 'outside':
         data: Any = simulation.data
@@ -119,28 +124,20 @@ def _physics(entry: Entry, days: float) -> tuple[Simulation, tuple[EffectSpec, .
     return simulation, effects
 
 
-def _also(entry: Entry) -> list[str]:
-    """Return the names that are true of a healthy unit: to give them is never wrong.
-
-    A unit built from physics has a reheater, and the paper's law with another exponent than 9/8.
-    """
-    if entry.plant == 'paper':
-        return []
-    return ['reheater', *(['exponent'] if _kind(entry).startswith('integrated_input') else [])]
-
-
-def _kind(entry: Entry) -> str:
-    """Return the kind of the valves of a unit built from physics."""
-    return str(np.random.default_rng([entry.seed, 2]).choice(np.array(list(KINDS))))
-
-
 def truth_of(entry: Entry, effects: tuple[EffectSpec, ...], content: bytes) -> dict[str, Any]:
-    """Return what is true of a record; ``sha256`` is that of its unpacked file."""
+    """Return what is true of a record; ``sha256`` is that of its unpacked file.
+
+    ``also`` are names that are true of a healthy unit: to give them is never wrong. A unit built
+    from physics has a reheater, and the paper's law with another exponent than 9/8.
+    """
+    also: list[str] = []
+    if entry.plant != 'paper':
+        exponent = kind_of(entry).startswith('integrated_input')
+        also = ['reheater', 'exponent'] if exponent else ['reheater']
     about = {
         'seed': entry.seed, 'plant': entry.plant, 'recording': entry.recording,
         'kind': entry.kind, 'label': entry.label, 'names': [e.name for e in effects],
-        'also': _also(entry),
-        'sha256': hashlib.sha256(content).hexdigest(),
+        'also': also, 'sha256': hashlib.sha256(content).hexdigest(),
     }  # fmt: skip
     for effect in effects:
         values = effect.parameters

@@ -34,40 +34,36 @@ def read(path: Path) -> dict[str, Any]:
     return found
 
 
-def checked(answers: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
-    """Return the answers after checking that each record has one that can be scored."""
+def check(answers: dict[str, Any], truth: dict[str, Any]) -> None:
+    """Check that each record has an answer, and that each can be scored."""
     for name in truth:
         if name not in answers:
             raise InputError(
                 f"The answers have no entry '{name}': each record needs one, "
                 'with "names": [] if it is healthy.'
             )
-    for name, answer in answers.items():
-        if name not in truth:
-            raise InputError(f"The answers name '{name}', which is no record of this set.")
-        _check(name, answer)
-    return answers
-
-
-def _check(record: str, answer: Any) -> None:
-    names = answer.get('names') if isinstance(answer, dict) else None
-    listed = isinstance(names, list) and all(isinstance(n, str) for n in names)
-    if not (listed or names == UNKNOWN):
-        raise InputError(
-            f"{record}: an answer needs 'names', a list of causes (empty: healthy) or '{UNKNOWN}'."
-        )
-    for key in set(answer) - {'names', *_ESTIMATES}:
-        raise InputError(f"{record}: '{key}' is not known; use names, {', '.join(_ESTIMATES)}.")
-    for name in answer['names'] if listed else ():
-        if name not in NAMES:
-            raise InputError(f"{record}: there is no cause '{name}'; use {', '.join(NAMES)}.")
-    for key in _ESTIMATES:
-        given = answer.get(key)
-        if given is None:
-            continue
-        numbers = [given.get(k) for k in _NUMBERS] if isinstance(given, dict) else [None]
-        if not all(isinstance(x, int | float) and np.isfinite(x) for x in numbers):
-            raise InputError(f"{record}: '{key}' needs the numbers value, low and high.")
+    for record, answer in answers.items():
+        if record not in truth:
+            raise InputError(f"The answers name '{record}', which is no record of this set.")
+        names = answer.get('names') if isinstance(answer, dict) else None
+        listed = isinstance(names, list) and all(isinstance(n, str) for n in names)
+        if not (listed or names == UNKNOWN):
+            raise InputError(
+                f"{record}: an answer needs 'names', a list of causes (empty: healthy) or "
+                f"'{UNKNOWN}'."
+            )
+        for key in set(answer) - {'names', *_ESTIMATES}:
+            known = ', '.join(_ESTIMATES)
+            raise InputError(f"{record}: '{key}' is not known; use names, {known}.")
+        for name in names if listed else ():
+            if name not in NAMES:
+                raise InputError(f"{record}: there is no cause '{name}'; use {', '.join(NAMES)}.")
+        for key in _ESTIMATES:
+            given = answer.get(key)
+            numbers = [given.get(k) for k in _NUMBERS] if isinstance(given, dict) else [None]
+            right = all(isinstance(x, int | float) and np.isfinite(x) for x in numbers)
+            if not (given is None or right):
+                raise InputError(f"{record}: '{key}' needs the numbers value, low and high.")
 
 
 def outcome(truth: dict[str, Any], answer: dict[str, Any]) -> str:
@@ -93,7 +89,7 @@ def wilson(count: int, of: int) -> list[float]:
 
 def score(truth: dict[str, Any], answers: dict[str, Any]) -> dict[str, Any]:
     """Return the counts of all records and of each kind, cause and plant, sizes and onsets."""
-    answers = checked(answers, truth)
+    check(answers, truth)
     rows = [
         {**t, 'outcome': outcome(t, answers[r]), 'answer': answers[r],
          'place': f'{t["plant"]}, {t["recording"]}'}

@@ -125,7 +125,7 @@ def _others(shift: Shift, numbers: list[int], curve: Characteristic) -> str:
 
 # The errors of curves assume uniform samples over a piece and noise with a short correlation
 # time. With slow noise of 1 MW, differences of clean plants were 1.8 times larger than these
-# errors (benchmarks/shift_study.py --wander 1, seeds 1 to 5); without it not (seeds 1 to 12).
+# errors (plants of the paper's kind, seeds 1 to 5); without it not (seeds 1 to 12).
 _WIDER = 1.8
 _PROFILE = 101  # points along a piece
 # Limits of p-value and standard errors for reporting a change within the data of a curve.

@@ -34,7 +34,7 @@ KNEE_GAIN = 12.0
 _SURE = 1e3  # upper limit of the gain, to avoid overflow
 # Factor of the log-likelihood in the probabilities: a breakpoint may exist although the data
 # hardly show it. Chosen on 66 random units of one to four days, of which 81 % were right;
-# `benchmarks.joint_selection_study` tests it on others.
+# `benchmarks.coverage_study` tests it on others.
 _ODDS_EXPONENT = 0.2
 _CANDIDATES = 30
 _BLOCKS = 60

@@ -187,7 +187,7 @@ _DAY_S = 86400.0
 # gave one alarm in 25 to 28 days instead of 30 (`benchmarks.alarm_run_length`).
 _SPARE = 1.4
 # A curve from few data has not seen all operation of its unit; where it first meets new operation,
-# it is wrong for a quarter of an hour. `benchmarks.young_curves` counts the resulting alarms.
+# it is wrong for a quarter of an hour. `benchmarks.monitor_study` tells the days of the alarms.
 _YOUNG_DAYS = 0.4
 _HIGHEST = 400.0
 _LEAST_LIMIT = 4.5  # more than one clipped block can add

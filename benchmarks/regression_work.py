@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is measured: the same small work for whichever tree Python finds first.
 
-    python work.py make FOLDER          make the inputs
-    python work.py FOLDER [NAME ...]    do the work, print the seconds of each as JSON
+    python regression_work.py make FOLDER          make the inputs
+    python regression_work.py FOLDER [NAME ...]    do the work, print the seconds of each as JSON
 
 It uses only what earlier trees have, too.
 """

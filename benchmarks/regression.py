@@ -17,24 +17,85 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import tarfile
 import tempfile
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from statistics import median
 
-from benchmarks.regression.judge import LEAST_PAIRS, LIMIT, judge, table
-from benchmarks.regression.work import NAMES
+from benchmarks import study
+from benchmarks.regression_work import NAMES
 
-ROOT = Path(__file__).resolve().parents[2]
-RESULTS = ROOT / 'benchmarks' / 'results'
-BASE = RESULTS / 'regression_base'
-WORK = Path(__file__).with_name('work.py')
+ROOT = Path(__file__).resolve().parents[1]
+WORK = Path(__file__).with_name('regression_work.py')
 _LONGEST_S = 600.0
+# Slower than so many times the base is a failure.
+LIMIT = 1.25
+LEAST_PAIRS = 7
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found of one piece of work.
+
+    Attributes
+    ----------
+    name : str
+    base_s, here_s : float
+        Medians of the processor's time.
+    ratio : float
+        Median of the pairs' ratios, new by old; a pair ran one straight after the other, so that
+        both met about the same neighbours on the machine.
+    low, high : float
+        Quarters of the pairs lie below and above.
+    slower : bool
+        The ratio is above the limit.
+    """
+
+    name: str
+    base_s: float
+    here_s: float
+    ratio: float
+    low: float
+    high: float
+    slower: bool
+
+
+def judge(pairs: Mapping[str, Sequence[tuple[float, float]]]) -> list[Verdict]:
+    """Judge every piece of work by its pairs of times, of the base and of this tree.
+
+    Raises
+    ------
+    ValueError
+        If one has fewer pairs than `LEAST_PAIRS`, or a time that is none.
+    """
+    found = []
+    for name, times in pairs.items():
+        if len(times) < LEAST_PAIRS:
+            raise ValueError(f'{name}: {len(times)} pairs, {LEAST_PAIRS} are wanted at least')
+        if not all(0.0 < seconds < float('inf') for pair in times for seconds in pair):
+            raise ValueError(f'{name}: a time that is none')
+        ratios = sorted(here / base for base, here in times)
+        ratio, quarter = median(ratios), len(ratios) // 4
+        base_s, here_s = (median(column) for column in zip(*times, strict=True))
+        ends = ratios[quarter], ratios[-1 - quarter]
+        found.append(Verdict(name, base_s, here_s, ratio, *ends, ratio > LIMIT))
+    return found
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """Return the verdicts as lines to read."""
+    lines = [f'{"work":10} {"base":>8} {"here":>8} {"here/base":>10}   half of the pairs']
+    for v in verdicts:
+        lines.append(
+            f'{v.name:10} {v.base_s:7.3f}s {v.here_s:7.3f}s {v.ratio:10.3f}   '
+            f'{v.low:.3f} to {v.high:.3f}{"   SLOWER" if v.slower else ""}'
+        )
+    return '\n'.join(lines)
 
 
 def git(*words: str) -> bytes:
@@ -46,7 +107,7 @@ def git(*words: str) -> bytes:
 def usual_base() -> str:
     """Return the commit to compare with where none is named."""
     tag = git('describe', '--tags', '--abbrev=0').decode().strip()
-    return tag or BASE.read_text('utf-8').strip()
+    return tag or (study.RESULTS / 'regression_base').read_text('utf-8').strip()
 
 
 def unpacked(commit: str, place: Path) -> Path:
@@ -94,9 +155,8 @@ def measured(
     """Return the pairs of times, of base and here."""
     pairs: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     for k in range(rounds):
-        order = ('base', 'here') if k % 2 == 0 else ('here', 'base')
         times: dict[str, dict[str, float]] = {}
-        for which in order:
+        for which in ('base', 'here') if k % 2 == 0 else ('here', 'base'):
             said = ran(trees[which], str(inputs), *names)
             if said is None:
                 raise SystemExit(f'regression: {which} failed in round {k + 1}')
@@ -106,13 +166,6 @@ def measured(
     return pairs
 
 
-def command(commit: str, given: argparse.Namespace) -> str:
-    """Return what was asked for, as a command."""
-    words = ['python -m benchmarks.regression', '--base', commit, '--rounds', str(given.rounds)]
-    words += ['--only', *given.only] if given.only != list(NAMES) else []
-    return ' '.join([*words, *(['--tree', given.tree.name] if given.tree != ROOT else [])])
-
-
 def run(given: argparse.Namespace) -> int:
     """Compare, print, write; return the exit status."""
     commit = given.base or usual_base()
@@ -120,8 +173,7 @@ def run(given: argparse.Namespace) -> int:
         place = Path(name)
         inputs = place / 'inputs'
         inputs.mkdir()
-        base = unpacked(commit, place / 'base')
-        trees = {'base': base, 'here': given.tree.resolve()}
+        trees = {'base': unpacked(commit, place / 'base'), 'here': given.tree.resolve()}
         if ran(ROOT, 'make', str(inputs)) is None:
             raise SystemExit('regression: the inputs cannot be made')
         names = comparable(trees, inputs, given.only)
@@ -131,12 +183,10 @@ def run(given: argparse.Namespace) -> int:
     print(table(verdicts))
     slower = [v.name for v in verdicts if v.slower]
     if given.output is not None:
-        content: dict[str, Any] = {
-            'command': command(commit, given),
-            'limit': LIMIT, 'slower': slower, 'verdicts': [asdict(v) for v in verdicts],
-            'pairs_s': pairs,
-            'machine': {'cpus': os.cpu_count(), 'load': os.getloadavg(),
-                        'platform': platform.platform(), 'python': platform.python_version()},
+        content = {
+            'command': study.command(), 'base': commit, 'limit': LIMIT, 'slower': slower,
+            'verdicts': [asdict(v) for v in verdicts], 'pairs_s': pairs,
+            'machine': study.machine(),
         }  # fmt: skip
         given.output.write_text(json.dumps(content, indent=1) + '\n', 'utf-8')
     for name in slower:
@@ -146,12 +196,8 @@ def run(given: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    """Run it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study.options(__doc__, rounds=LEAST_PAIRS)
     parser.add_argument('--base', metavar='COMMIT')
-    parser.add_argument('--rounds', type=int, default=LEAST_PAIRS)
     parser.add_argument('--only', nargs='+', choices=NAMES, default=list(NAMES), metavar='NAME')
     parser.add_argument('--tree', type=Path, default=ROOT, help='another tree than this one')
     parser.add_argument('--output', type=Path, metavar='FILE', help='write the figures as JSON')
