@@ -242,3 +242,14 @@ def values_in(folder: Path) -> list[float]:
         return open_log(folder).readings.value.tolist()
     except RecordingError:
         return []
+
+
+def numbers_in_chunks(raw: bytes) -> list[int]:
+    """Return the number of messages of each chunk, by the indexes that follow it."""
+    counts: list[int] = []
+    for op, begin, end in records(raw):
+        if op == Opcode.CHUNK:
+            counts.append(0)
+        elif op == Opcode.MESSAGE_INDEX:
+            counts[-1] += (end - begin - RECORD_HEAD.size - 6) // 16
+    return counts
