@@ -146,7 +146,7 @@ def scalar(kind):
     return st.integers(int(info.min), int(info.max))
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(data=st.data(), little=st.booleans())
 def test_decoding_agrees_with_an_independent_library(data, little):
     name = data.draw(st.sampled_from([ARRAY, *OWN]))

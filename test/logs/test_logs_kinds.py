@@ -75,7 +75,7 @@ def unchecked_sentence(kind: Kind) -> tuple[str, ...]:
     return (f'{" and ".join(parts)}; damage there cannot be seen.',)
 
 
-@settings(max_examples=200)
+@settings(max_examples=120)
 @given(KINDS)
 @example(Kind(topics='before'))
 @example(Kind(topics='before', summary=False))
@@ -200,7 +200,7 @@ def ends_of_messages(raw: bytes) -> list[int]:
     return [end for op, _, end in records(raw) if op == Opcode.MESSAGE]
 
 
-@pytest.mark.parametrize('step', [11, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize('step', [23, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize('outside', ['none', 'some', 'all'])
 def test_a_file_without_checksums_that_is_cut_anywhere_keeps_what_stands_before(
     path, outside, step
@@ -218,7 +218,7 @@ def test_a_file_without_checksums_that_is_cut_anywhere_keeps_what_stands_before(
                 open_log(path)
             continue
         assert len(read(path)) == whole, size
-        if size in borders or size % 17 == 0:
+        if size in ends or size % 17 == 0:
             out, report = recovered(path)
             assert (report.messages, report.damaged_chunks) == (whole, 0), size
             assert in_file(out.read_bytes()) == truth[:whole]

@@ -97,7 +97,7 @@ def message_lists(draw):
     return messages
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(messages=message_lists(), flush_every=st.integers(1, 9))
 def test_reading_at_once_is_reading_one_by_one(tmp_path_factory, messages, flush_every):
     folder = tmp_path_factory.mktemp('log')

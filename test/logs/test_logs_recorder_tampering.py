@@ -79,7 +79,7 @@ def append(path: Path) -> None:
 
 def overwrite(path: Path) -> None:
     with path.open('r+b') as file:
-        file.seek(path.stat().st_size // 2)
+        file.seek(path.stat().st_size // 8)
         file.write(bytes(50))
 
 

@@ -68,7 +68,7 @@ def test_what_is_written_reads_back_to_the_same_bits(tmp_path, suffix):
         assert np.array_equal(np.signbit(table_of(raw).values), np.signbit(table.values))
         assert raw.notes == ()
 
-    settings(max_examples=60)(given(table=tables())(check))()
+    settings(max_examples=30)(given(table=tables())(check))()
     zeros = np.array([0.0, -0.0, 7.0])
     check(SampleTable.from_columns(START_NS + np.arange(3), dict.fromkeys(Signal, zeros)))
 

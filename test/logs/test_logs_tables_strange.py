@@ -142,7 +142,7 @@ WIDE = ('time', *(info.column for info in SIGNALS[:4]))
 LONG = ('Tag', 'Time', 'Value', 'Quality')
 # Opens a table, says why not, and how much memory that took in MB.
 OPEN = """
-import resource, sys
+import sys
 from valveflow_ros.errors import ValveflowError
 import valveflow_ros as vf
 try:
@@ -150,7 +150,7 @@ try:
     print('read')
 except ValveflowError as error:
     print(str(error).replace(chr(10), ' '))
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+print(next(int(line.split()[1]) // 1024 for line in open('/proc/self/status') if 'VmHWM' in line))
 """
 
 

@@ -63,14 +63,14 @@ RECORD = st.one_of(
 )
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(RECORD, st.integers(1, 150)), max_size=6))
 def test_runs_and_single_records_are_found_as_by_a_loop(runs):
     content = b''.join(record * count for record, count in runs)
     assert quick_walk(content) == naive_walk(content)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.lists(RECORD, min_size=1, max_size=80), st.data())
 def test_broken_contents_are_refused_as_by_a_loop(records, data):
     content = bytearray(b''.join(records))

@@ -7,10 +7,9 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 from valveflow_ros.errors import RecordingError
@@ -33,8 +32,8 @@ def printable(name: str) -> str:
     return ''.join(letter if letter.isprintable() else '?' for letter in name)
 
 
-@dataclass(slots=True)
-class Source:
+@dataclass
+class Source(AbstractContextManager['Source']):
     """A regular file and the size it had when it was opened."""
 
     path: str
@@ -43,13 +42,12 @@ class Source:
 
     @classmethod
     def open(cls, path: str | Path) -> Source:
-        """Open a regular file.
+        """Open a regular file, without blocking on a FIFO or a device.
 
         Raises
         ------
         RecordingError
-            If it is absent, unreadable, empty, or not a regular file. The call
-            does not block on a FIFO or a device.
+            If it is absent, unreadable, empty, or not a regular file.
         """
         name = str(path)
         try:
@@ -58,43 +56,24 @@ class Source:
         except ValueError:
             raise RecordingError(printable(name), 'is not a name of a file') from None
         status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode) or status.st_size == 0:
+        regular = stat.S_ISREG(status.st_mode)
+        if not regular or status.st_size == 0:
             os.close(descriptor)
-            regular = stat.S_ISREG(status.st_mode)
             raise RecordingError(name, 'is empty' if regular else 'is not a regular file')
         stream = os.fdopen(descriptor, 'rb', buffering=BUFFER_BYTES)
         return cls(name, stream, status.st_size)
 
     def read(self, position: int, size: int) -> bytes:
-        """Return up to ``size`` bytes; fewer at the end of the file.
-
-        Raises
-        ------
-        RecordingError
-            If the device fails.
-        """
+        """Return up to ``size`` bytes; raises `RecordingError` if the device fails."""
         if position >= self.size:
             return b''
         with os_errors(self.path, f'cannot be read at byte {position}'):
             self.stream.seek(position)
             return self.stream.read(min(size, self.size - position))
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file."""
         self.stream.close()
-
-    def __enter__(self) -> Source:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the file."""
-        self.close()
 
 
 MIB = 1 << 20

@@ -87,18 +87,14 @@ class RecorderStatus:
 
     Attributes
     ----------
-    state : RecorderState
-        State of the recorder.
-    reason : str
-        Why it is not recording; empty if it is.
+    state, reason
+        State of the recorder, and why it is not recording; empty if it is.
     file : str
         Name of the current split on disk; empty if none.
     received : int
         Messages passed to the recorder.
-    written : int
-        Of these, messages in complete chunks of existing files.
-    queued : int
-        Of these, messages that wait to be written.
+    written, queued : int
+        Of these, messages in complete chunks of existing files, and that wait to be written.
     lost : int
         Of these, messages that waited when the recorder had to stop, or in files that another
         program removed or changed while they were written, or damaged afterwards.
@@ -108,10 +104,8 @@ class RecorderStatus:
         Of these, messages in finished files deleted since, by ``keep_files`` or another program.
     dropped : dict[str, int]
         Of these, messages refused because too many were waiting or the recorder was closed.
-    files_finished : int
-        Splits finished since the start.
-    bytes_written : int
-        Bytes written since the start.
+    files_finished, bytes_written : int
+        Splits finished and bytes written since the start.
     recovered : tuple of RecoveryReport
         Unfinished files of an earlier recorder that were recovered at the start.
     stalled_s : float
@@ -142,11 +136,9 @@ class RecorderCounters:
     """
 
     def __init__(self, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._dropped_at = -math.inf
+        self._clock, self._limit = clock, limit
         self._lock = threading.Lock()
-        self._limit = limit
-        self._open = True
+        self._open, self._dropped_at = True, -math.inf
         self._now = RecorderStatus(RecorderState.RECORDING)
         self._drops = self._lost_in_files = 0
         self._working_since_s: float | None = None
@@ -207,8 +199,7 @@ class RecorderCounters:
 
     def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
         """Set the reports of recovered files."""
-        with self._lock:
-            self._now.recovered = reports
+        self._now.recovered = reports
 
     def stopped(self, reason: str = '') -> None:
         """Set the final state; messages that still wait are counted as lost."""
@@ -248,18 +239,12 @@ class RecorderLoop:
     """Runs the writer in a thread; all methods but `start` may be called from other threads."""
 
     def __init__(
-        self,
-        folder: Path,
-        settings: RecorderSettings,
-        make_writer: Callable[..., RecordingWriter],
-        counters: RecorderCounters,
+        self, folder: Path, settings: RecorderSettings,
+        make_writer: Callable[..., RecordingWriter], counters: RecorderCounters,
         free_bytes: Callable[[Path], int],
-    ) -> None:
-        self._folder = folder
-        self._settings = settings
-        self._make_writer = make_writer
-        self._counters = counters
-        self._free_bytes = free_bytes
+    ) -> None:  # fmt: skip
+        self._folder, self._settings, self._counters = folder, settings, counters
+        self._make_writer, self._free_bytes = make_writer, free_bytes
         self._queue: deque[NewTopic | Message] = deque()
         self._latching: set[str] = set()
         self._fresh: dict[str, Message] = {}
@@ -268,14 +253,10 @@ class RecorderLoop:
         self._path: Path | None = None
         self._begun_at = self._synced_at = self._retry_at = self._looked_at = 0.0
         self._retry_wait = settings.retry_s
-        self.rotation_asked = False
-        self._stopping = False
+        self.rotation_asked = self._stopping = False
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
+        self.start = self._thread.start
 
     def latched(self) -> list[Message]:
         """Return the latched messages to repeat at the start of a new split."""
@@ -329,7 +310,12 @@ class RecorderLoop:
             writer = self._ready()
             self._counters.working()
             writer.check()
-            self._check_finished(writer, now)
+            if now - self._looked_at >= _LOOK_S:
+                self._looked_at = now
+                # A changed file is read again, which may take long and is not a stall.
+                self._counters.resting()
+                writer.check_finished()
+                self._counters.working()
             self._check_space(writer)
             self._drain(writer)
             self._counters.working()
@@ -338,7 +324,9 @@ class RecorderLoop:
             self._latched.update(self._fresh)
             self._fresh = {}
             self._counters.working()
-            self._sync(writer, now)
+            if 0 < self._settings.sync_period_s <= now - self._synced_at:
+                writer.sync()
+                self._synced_at = now
             self._counters.working()
             self._rotate(writer, now)
         except RecordingError as error:
@@ -360,14 +348,6 @@ class RecorderLoop:
             self._writer = self._make_writer(head_messages=self.latched)
         return self._writer
 
-    def _check_finished(self, writer: RecordingWriter, now: float) -> None:
-        if now - self._looked_at >= _LOOK_S:
-            self._looked_at = now
-            # A changed file is read again, which may take long and is not a stall.
-            self._counters.resting()
-            writer.check_finished()
-            self._counters.working()
-
     def _check_space(self, writer: RecordingWriter) -> None:
         floor = self._settings.free_floor_bytes
         try:
@@ -386,25 +366,16 @@ class RecorderLoop:
             self._counters.working()
             item = self._queue.popleft()
             if isinstance(item, NewTopic):
+                topic, type_name, qos, type_hash, definition, latched = item
                 writer.add_topic(
-                    item.topic,
-                    item.type_name,
-                    qos=item.qos,
-                    type_hash=item.type_hash,
-                    definition=item.definition,
+                    topic, type_name, qos=qos, type_hash=type_hash, definition=definition
                 )
-                if item.latched:
-                    self._latching.add(item.topic)
+                if latched:
+                    self._latching.add(topic)
                 continue
             if item.topic in self._latching:
                 self._fresh[item.topic] = item
-            writer.write(item.topic, item.data, item.log_time_ns, item.publish_time_ns)
-
-    def _sync(self, writer: RecordingWriter, now: float) -> None:
-        period = self._settings.sync_period_s
-        if period > 0 and now - self._synced_at >= period:
-            writer.sync()
-            self._synced_at = now
+            writer.write(*item)
 
     def _rotate(self, writer: RecordingWriter, now: float) -> None:
         if writer.path != self._path:
@@ -508,14 +479,9 @@ class Recorder:
         self._topics: dict[str, str] = {}
         self._counters = RecorderCounters(self._settings.queue_limit)
         make_writer = partial(
-            RecordingWriter,
-            self.folder,
-            name=name,
-            definitions=self._definitions,
-            attachments=attachments,
-            metadata=metadata,
-            open_file=open_file,
-        )
+            RecordingWriter, self.folder, name=name, definitions=self._definitions,
+            attachments=attachments, metadata=metadata, open_file=open_file,
+        )  # fmt: skip
         self._loop = RecorderLoop(
             self.folder, self._settings, make_writer, self._counters, free_bytes
         )

@@ -92,31 +92,32 @@ class Unpacker:
         is allocated for the result.
         """
         try:
-            if compression == 'zstd':
-                # The library allocates the size that a frame states, so this size is first
-                # compared with that of the chunk.
-                stated = zstandard.frame_content_size(packed)
-                content = b''
-                if size and stated in (-1, size):
-                    content = bytes(self._decompressor.decompress(packed, max_output_size=size))
-                elif stated not in (-1, size):
-                    raise LayoutError('a chunk unpacks to another size than it claims')
-            elif compression == 'lz4':
-                unpacker = lz4.frame.LZ4FrameDecompressor()
-                content = bytes(unpacker.decompress(packed, max_length=size + 1))
-            elif not compression:
-                content = packed
-            else:
-                raise LayoutError(f"unknown compression '{compression[:16]}'")
+            content = self._unpacked(compression, packed, size)
         except LayoutError:
             raise
         except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
             raise LayoutError(f'a chunk cannot be unpacked ({error})') from None
-        if len(content) != size:
-            if not compression:
-                raise LayoutError('an uncompressed chunk differs from the size it claims')
-            raise LayoutError('a chunk unpacks to another size than it claims')
-        return content
+        if len(content) == size:
+            return content
+        if not compression:
+            raise LayoutError('an uncompressed chunk differs from the size it claims')
+        raise LayoutError('a chunk unpacks to another size than it claims')
+
+    def _unpacked(self, compression: str, packed: bytes, size: int) -> bytes:
+        if compression == 'zstd':
+            # The library allocates the size that a frame states, so this size is first compared
+            # with that of the chunk.
+            stated = zstandard.frame_content_size(packed)
+            if stated not in (-1, size):
+                raise LayoutError('a chunk unpacks to another size than it claims')
+            unpack = self._decompressor.decompress
+            return bytes(unpack(packed, max_output_size=size)) if size else b''
+        if compression == 'lz4':
+            unpacker = lz4.frame.LZ4FrameDecompressor()
+            return bytes(unpacker.decompress(packed, max_length=size + 1))
+        if compression:
+            raise LayoutError(f"unknown compression '{compression[:16]}'")
+        return packed
 
 
 @dataclass(slots=True)
@@ -140,22 +141,19 @@ class TopicTable:
 
     def add(self, op: int, content: bytes, checked: bool = True) -> None:
         """Add a raw schema or channel record; raises `LayoutError` as `take`, or if malformed."""
-        record = definition(op, content)
-        if record is not None:
+        if record := definition(op, content):
             self.take(record, checked)
 
     def take(self, record: Schema | Channel, checked: bool = True) -> None:
         """Add a schema or a channel.
 
-        Raises
-        ------
-        LayoutError
-            If it contradicts an earlier one, or a limit is exceeded.
+        Raises `LayoutError` if it contradicts an earlier one, or a limit is exceeded.
         """
-        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
-        key = ('schema' if isinstance(record, Schema) else 'channel', record.id)
+        is_schema = isinstance(record, Schema)
+        known: dict[int, Any] = self.schemas if is_schema else self.channels
+        key = ('schema' if is_schema else 'channel', record.id)
         before = known.get(record.id)
-        if before is None or before != record:
+        if before != record:
             if before is not None and (not checked or key not in self.unchecked):
                 raise LayoutError(f'it defines {key[0]} {key[1]} twice, differently')
             self._check_size(len(known) - (before is not None), record)
@@ -168,10 +166,9 @@ class TopicTable:
 
     def take_over(self, other: TopicTable) -> None:
         """Add all records of another table; raises `LayoutError` like `take`."""
-        for number, schema in other.schemas.items():
-            self.take(schema, ('schema', number) not in other.unchecked)
-        for number, channel in other.channels.items():
-            self.take(channel, ('channel', number) not in other.unchecked)
+        for kind, known in (('schema', other.schemas), ('channel', other.channels)):
+            for number, record in known.items():
+                self.take(record, (kind, number) not in other.unchecked)
 
     def type_of(self, channel: Channel) -> str:
         """Return the type of a channel; empty if the file does not state it."""
@@ -238,14 +235,12 @@ def read_summary(source: Source) -> Summary | None:
     summary, position = Summary(), 0
     try:
         while position < len(raw):
-            op, content = record_at(raw, position)
+            op, content = _record_at(raw, position)
             position += RECORD_HEAD.size + len(content)
             if op == Opcode.STATISTICS:
                 found = unpack(Statistics.read, content)
-                summary.messages, summary.counts = (
-                    found.message_count,
-                    found.channel_message_counts,
-                )
+                summary.messages = found.message_count
+                summary.counts = found.channel_message_counts
                 summary.start_ns, summary.end_ns = found.message_start_time, found.message_end_time
             else:
                 summary.table.add(op, content, checked)
@@ -254,12 +249,9 @@ def read_summary(source: Source) -> Summary | None:
     return summary
 
 
-def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
-    """Return opcode and content of the record at a position; raises `LayoutError`."""
+def _record_at(raw: bytes, position: int) -> tuple[int, bytes]:
     start = position + RECORD_HEAD.size
-    if start > len(raw):
-        raise LayoutError('a record is shorter than what it says it holds')
-    op, length = RECORD_HEAD.unpack_from(raw, position)
+    op, length = RECORD_HEAD.unpack_from(raw, position) if start <= len(raw) else (0, 0)
     if start + length > len(raw):
         raise LayoutError('a record is shorter than what it says it holds')
     return op, raw[start : start + length]
@@ -268,16 +260,10 @@ def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
 # Most chunks of a plant are one run of records of equal size (four Float64 topics: 43 bytes each).
 # Such a run is found in one step; anything else is read record by record.
 HEAD_SIZE = RECORD_HEAD.size + MESSAGE_HEAD.size
-HEAD_DTYPE = np.dtype(
-    [
-        ('op', 'u1'),
-        ('length', '<u8'),
-        ('channel', '<u2'),
-        ('sequence', '<u4'),
-        ('log_time', '<i8'),
-        ('publish_time', '<i8'),
-    ]
-)
+HEAD_DTYPE = np.dtype([
+    ('op', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+    ('log_time', '<i8'), ('publish_time', '<i8'),
+])  # fmt: skip
 RUN_PROBE = 64
 _FEW_BREAKS = 64
 MAX_TOPIC_RECORDS = 1 << 16
@@ -314,25 +300,16 @@ class MessageTable:
 def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     """Return the messages and the schema and channel records of chunk contents.
 
-    Raises
-    ------
-    LayoutError
-        If a record is cut off, or of a kind that is not allowed in a chunk. Opcodes unknown to
-        the format are skipped.
+    Opcodes unknown to the format are skipped. Raises `LayoutError` if a record is cut off, or of
+    a kind that is not allowed in a chunk.
     """
     starts, others = _boundaries(content)
-    if not len(starts):
-        return _EMPTY, others
     heads = rows(content, HEAD_DTYPE, 0, starts)
-    table = MessageTable(
-        np.ascontiguousarray(heads['channel']),
-        np.ascontiguousarray(heads['sequence']),
-        np.ascontiguousarray(heads['log_time']),
-        np.ascontiguousarray(heads['publish_time']),
-        starts,
-        heads['length'].astype(np.int64) - MESSAGE_HEAD.size,
-    )
-    if table.log_time.min() < 0 or table.publish_time.min() < 0:
+    fields = ('channel', 'sequence', 'log_time', 'publish_time')
+    columns = [np.ascontiguousarray(heads[name]) for name in fields]
+    sizes = heads['length'].astype(np.int64) - MESSAGE_HEAD.size
+    table = MessageTable(*columns, starts, sizes)
+    if len(table) and min(table.log_time.min(), table.publish_time.min()) < 0:
         raise LayoutError('a message claims a time after the year 2262')
     return table, others
 
@@ -403,9 +380,8 @@ def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
     position, end, probe = 0, len(content), True
     unpack = RECORD_HEAD.unpack_from
     while position < end:
-        if end - position < RECORD_HEAD.size:
-            raise LayoutError('a chunk ends in the middle of a record')
-        op, length = unpack(content, position)
+        whole = position + RECORD_HEAD.size <= end
+        op, length = unpack(content, position) if whole else (0, end)
         after = position + RECORD_HEAD.size + length
         if after > end:
             raise LayoutError('a chunk ends in the middle of a record')
@@ -450,13 +426,3 @@ def _run(content: bytes, position: int, stride: int) -> int:
             return known + int(same.argmin())
         known, limit = known + taken, 2 * limit
     return count
-
-
-_EMPTY = MessageTable(
-    np.empty(0, dtype=np.uint16),
-    np.empty(0, dtype=np.uint32),
-    np.empty(0, dtype=np.int64),
-    np.empty(0, dtype=np.int64),
-    np.empty(0, dtype=np.int64),
-    np.empty(0, dtype=np.int64),
-)
