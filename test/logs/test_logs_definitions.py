@@ -93,12 +93,6 @@ def test_installed_definitions_come_before_bundled_ones(tmp_path, monkeypatch):
         assert definitions.text(FLOAT64) == '# with a comment\nfloat64 data\n'
 
 
-def test_dependencies_follow_the_separator_in_the_way_of_recordings():
-    head, time = STOCK.text('std_msgs/msg/Header').split(f'{SEPARATOR}\n')
-    assert 'string frame_id' in head
-    assert time.startswith('MSG: builtin_interfaces/Time\n')
-
-
 def test_names_are_written_either_way():
     assert full_name('std_msgs/Header') == full_name('std_msgs/msg/Header')
     assert parse_fields('Header header', 'demo_msgs') == (Field('header', 'std_msgs/msg/Header'),)

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_files import FLOAT64, START_NS, STOCK, float64
 from mcap.opcode import Opcode
-from monitor_recording import TYPES, Monitor, cdr, diagnosis, recording, stamp
+from monitor_recording import Monitor, recording
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import Decoder, Message, RecordingWriter, messages_since, open_log
+from valveflow_ros.logs import Message, RecordingWriter, messages_since, open_log
 from valveflow_ros.logs.mcap import reading
 from valveflow_ros.logs.mcap.folder import Split, finished_files
 from valveflow_ros.logs.mcap.follow import Follower
@@ -22,15 +22,6 @@ from valveflow_ros.logs.source import Source
 
 DAY_NS = 24 * 3600 * 10**9
 N = 900
-
-
-def test_the_made_up_messages_are_read_as_they_were_meant():
-    for kind in set(TYPES.values()) - {FLOAT64}:
-        Decoder(kind, STOCK.text(kind)).decode(cdr(kind, {}))
-    kind = 'valveflow_msgs/msg/Diagnosis'
-    fields = Decoder(kind, STOCK.text(kind)).decode(diagnosis(START_NS, 2, 'It sticks.', 'a', 'b'))
-    assert [cause['name'] for cause in fields['causes']] == ['a', 'b']
-    assert fields['header'] == {'stamp': stamp(START_NS), 'frame_id': 'U1'}
 
 
 def times(follower):

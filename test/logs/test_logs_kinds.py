@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 from collections import Counter
 
 import pytest
@@ -129,21 +128,6 @@ def test_every_kind_is_read_recovered_and_followed_as_stock_readers_read_it(
     if kind.topics != 'summary':
         told = {c.topic for c in batches[-1].topics.channels.values()}
         assert told == {channel.topic for channel in CHANNELS}
-
-
-@pytest.mark.parametrize(
-    'kind', [Kind(topics='summary'), Kind(outside='some'), Kind(outside='all', chunk_crc=False)]
-)
-def test_info_lists_the_topics_of_every_kind(path, capsys, kind):
-    path.write_bytes(kind.write())
-    assert main(['info', str(path), '--json']) == 0
-    told = json.loads(capsys.readouterr().out)
-    expected = Counter(message.topic for message in kind.truth())
-    assert {t['name']: t['messages'] for t in told['topics']} == expected
-    unchecked = [w for w in told['warnings'] if 'checksum' in w or 'chunks' in w]
-    assert unchecked == [*unchecked_sentence(kind)]
-    counts = {topic.lstrip('/'): 4 * kind.chunks for topic in TOPICS}
-    assert {topic: s['readings'] for topic, s in told['signals'].items()} == counts
 
 
 def test_info_says_where_there_is_no_reading(path, capsys):

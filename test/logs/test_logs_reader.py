@@ -149,23 +149,6 @@ BARE = dict.fromkeys(
 )
 
 
-@pytest.mark.parametrize(
-    'options',
-    [*({'compression': kind, 'chunk_size': 500} for kind in CompressionType), BARE,
-     {'enable_crcs': False}, {'use_chunking': False}],
-)  # fmt: skip
-def test_recordings_of_others_are_read(tmp_path, options):
-    contents = open_log(foreign(tmp_path / 'other.mcap', **options))
-    assert contents.readings.value.tolist() == list(range(50))
-    counts = {name: info.count for name, info in contents.topics.items()}
-    assert counts == {'/hv1/valve_opening': 50, '/camera': 50}
-    assert len(list(contents.iter_messages(['/camera']))) == 50
-    unchecked = 'enable_crcs' in options or 'use_chunking' in options
-    assert [w.endswith('; damage there cannot be seen.') for w in contents.warnings] == (
-        [True] * unchecked
-    )
-
-
 def test_topics_of_other_names_are_read_where_they_are_named(tmp_path):
     path = foreign(tmp_path / 'other.mcap', topic='/cabin/noise')
     contents = open_log(path)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,20 +19,13 @@ from log_files import FLOAT64, STOCK
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import (
-    Message,
     RecorderSettings,
     RecorderState,
     RecordingWriter,
     open_log,
 )
 from valveflow_ros.logs.mcap import recorder
-from valveflow_ros.logs.mcap.recorder import (
-    DROPS_SHOWN_S,
-    NewTopic,
-    RecorderCounters,
-    RecorderLoop,
-)
-from valveflow_ros.logs.mcap.writer import Qos
+from valveflow_ros.logs.mcap.recorder import DROPS_SHOWN_S, RecorderCounters
 
 STEP_S = 7.0
 
@@ -81,33 +75,40 @@ class Writer(RecordingWriter):
 
 
 class Stage:
-    """A loop whose thread never runs: the test is the thread."""
+    """A recorder whose thread never runs: the test is the thread."""
 
     def __init__(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch, takes_s: float = 0.0, **given: Any
     ) -> None:
         self.folder, self.clock = folder, Clock()
         monkeypatch.setattr(recorder, 'time', self.clock)
+        monkeypatch.setattr(threading.Thread, 'start', lambda _: None)
         asked = {'free_floor_bytes': 0, 'sync_period_s': 0.0, **given}
-        self.settings = RecorderSettings(**asked)
+        self.recorder = recorder.Recorder(
+            folder, RecorderSettings(**asked), definitions=STOCK, free_bytes=lambda _: 1 << 50
+        )
         self.counters = RecorderCounters(10**6, clock=self.clock.monotonic)
+        self.recorder._counters = self.counters
+        self.recorder.add_topic('/a', FLOAT64)
         self.writer = Writer(self.clock, folder, takes_s)
-        self.free = 1 << 50
         self.made = 0
 
-        def made(**_: Any) -> Any:
+        def made() -> Any:
             self.made += 1
             return self.writer
 
-        self.loop = RecorderLoop(folder, self.settings, made, self.counters, lambda _: self.free)
+        self.recorder._make_writer = made
 
     def put(self, count: int = 1, topic: str = '/a') -> None:
         for _ in range(count):
-            assert self.counters.admit(topic)
-            self.loop.put(Message(topic, b'', 1, 1))
+            assert self.recorder.record(topic, b'', 1, 1)
 
     def cycle(self, stopping: bool = False) -> None:
-        self.loop._cycle(stopping)
+        self.recorder._cycle(stopping)
+
+    def run_to_the_end(self) -> None:
+        self.recorder._stopping = True
+        self.recorder._run()
 
 
 @pytest.fixture
@@ -228,18 +229,17 @@ def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(stage_of:
 
 def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(stage_of: Any) -> None:
     stage = stage_of()
-    stage.loop.put(NewTopic('/curve', 'x/msg/X', (Qos(),), 'hash', 'float64 data', True))
+    stage.recorder.add_topic('/curve', 'x/msg/X', definition='float64 data', latched=True)
     stage.put(2)
     stage.put(2, '/curve')
     stage.writer.bad = {'flush'}
     stage.cycle()
-    assert stage.loop.latched() == []
+    assert not stage.recorder._latched
     stage.writer.bad = set()
     stage.clock.now += 1.0
     stage.cycle()
-    assert [m.topic for m in stage.loop.latched()] == ['/curve']
-    told = open_log(stage.folder).topics['/curve']
-    assert (told.type_hash, told.definition) == ('hash', 'float64 data')
+    assert list(stage.recorder._latched) == ['/curve']
+    assert open_log(stage.folder).topics['/curve'].definition == 'float64 data'
 
 
 @pytest.mark.parametrize('bad', ['', 'note', 'close'])
@@ -248,9 +248,8 @@ def test_at_the_end_the_account_stands_in_the_file_and_a_failure_lets_go_of_it(
 ) -> None:
     stage = stage_of()
     stage.put(3)
-    stage.loop._stopping = True
     stage.writer.bad = {bad}
-    stage.loop._run()
+    stage.run_to_the_end()
     status = stage.counters.status()
     assert status.state == RecorderState.STOPPED
     assert status.reason == (f'log: {bad} failed.' if bad else '')
@@ -272,8 +271,7 @@ def test_what_never_began_says_that_nothing_could_be_recorded(
     monkeypatch.setattr(recorder, 'recover_leftovers', broken)
     stage = stage_of()
     stage.put()
-    stage.loop._stopping = True
-    stage.loop._run()
+    stage.run_to_the_end()
     status = stage.counters.status()
     assert (status.reason, status.lost) == ('nothing could be recorded', 1)
     assert status.stalled_s == 0.0

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
-from fault_points import SHORT, Faults
+from fault_points import Faults
 from log_files import (
     FLOAT64,
     START_NS,
@@ -29,7 +29,6 @@ from log_files import (
     read_back,
     records,
     stock,
-    values_in,
     write_chunks,
     write_part,
 )
@@ -158,24 +157,6 @@ def test_chunks_are_copied_as_they_are_and_recovering_again_changes_nothing(
     assert set(logs[0].metadata) == set(logs[1].metadata)
 
 
-def test_what_the_recorder_noted_is_in_the_recovered_file_too(tmp_path: Path) -> None:
-    writer = RecordingWriter(
-        tmp_path, definitions=STOCK, attachments={'a.txt': b'kept'},
-        metadata={'of the run': {'key': 'value'}},
-    )  # fmt: skip
-    writer.add_topic('/a', FLOAT64)
-    writer.write('/a', float64(1), START_NS, START_NS)
-    writer.flush()
-    writer.note('counters', {'received': '1'})
-    writer.abandon()
-    (part,) = tmp_path.glob('*.part')
-    recover(part, tmp_path / 'whole.mcap')
-    found = open_log(tmp_path / 'whole.mcap')
-    assert found.metadata['of the run'] == {'key': 'value'}
-    assert found.metadata['counters'] == {'received': '1'}
-    assert found.attachments['a.txt'] == b'kept'
-
-
 @pytest.mark.parametrize('content', [b'', MAGIC, bytes(4000)])
 def test_where_nothing_is_intact_nothing_is_made(tmp_path: Path, content: bytes) -> None:
     (tmp_path / 'bad.mcap').write_bytes(content)
@@ -201,24 +182,6 @@ def test_what_stands_in_the_way_of_the_output_is_kept(part: Path, tmp_path: Path
     held.close()
     recover(part, tmp_path / 'b.mcap')
     assert len(open_log(tmp_path / 'b.mcap').readings) == 400
-
-
-@pytest.mark.parametrize('lost', [0, 9, 19])
-def test_a_damaged_chunk_costs_itself_and_is_counted(
-    part: Path, tmp_path: Path, lost: int
-) -> None:
-    """Whole minus recovered is exactly what stood in the chunk that was hit."""
-    every, raw = read_back(open_log(part)), bytearray(part.read_bytes())
-    begin, end = [place for op, *place in records(raw) if op == Opcode.CHUNK][lost]
-    raw[(begin + end) // 2] ^= 4
-    part.write_bytes(raw)
-    report = recover(part, tmp_path / 'whole.mcap')
-    assert (report.messages, report.chunks, report.damaged_chunks) == (380, 19, 1)
-    assert (report.source, report.out) == (part, tmp_path / 'whole.mcap')
-    assert report.warnings
-    whole = open_log(tmp_path / 'whole.mcap')
-    assert whole.warnings == ()
-    assert read_back(whole) == every[: 20 * lost] + every[20 * lost + 20 :]
 
 
 def chunk(number: int, topic: str) -> PackedChunk:
@@ -321,13 +284,6 @@ def test_leftovers_of_the_dead_are_finished(part: Path) -> None:
         assert yaml.safe_load(text)['relative_file_paths'] == [path.name]
 
 
-def test_a_recovered_folder_is_read_by_stock_readers(part: Path) -> None:
-    recover_leftovers(part.parent)
-    assert names_in(part.parent) == ['log_0.mcap', 'metadata.yaml']
-    with AnyReader([part.parent]) as reader:
-        assert reader.message_count == 400
-
-
 @pytest.mark.parametrize('call', range(1, 41))
 def test_wherever_a_recovery_fails_the_next_one_completes_it(part: Path, call: int) -> None:
     """All messages stand in the part or in the whole file at every moment, never in neither."""
@@ -351,16 +307,6 @@ def test_wherever_a_recovery_fails_the_next_one_completes_it(part: Path, call: i
     assert names == {'log_0.mcap', 'log_3.mcap', 'metadata.yaml'} or not reports
     assert [len(open_log(path).readings) for path in whole] == [400, 400]
     assert not any(folder.glob('*.part'))
-
-
-def test_a_crash_between_the_two_steps_of_a_recovery_loses_nothing(part: Path) -> None:
-    copy = part.read_bytes()
-    recover_leftovers(part.parent)
-    part.write_bytes(copy)
-    assert len(open_log(part.parent).readings) == 400
-    [report] = recover_leftovers(part.parent)
-    assert report.messages == 400
-    assert len(open_log(part.parent).readings) == 400
 
 
 def test_a_folder_without_leftovers_is_not_touched(tmp_path: Path) -> None:
@@ -396,22 +342,6 @@ def test_a_part_whose_only_chunk_was_begun_goes(part: Path) -> None:
         part.write_bytes(content)
         assert recover_leftovers(part.parent) == ()
         assert part.exists() == (content is damaged), len(content)
-
-
-def test_why_a_folder_cannot_be_read_is_said_in_the_systems_words(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for error, words in (
-        (OSError(errno.EIO, 'Input/output error'), r'recovered \(input/output error\)'),
-        (OSError('Only this'), r'recovered \(only this\)'),
-    ):
-
-        def broken(_path: Path, _pattern: str, error: OSError = error) -> list[Path]:
-            raise error
-
-        monkeypatch.setattr(Path, 'glob', broken)
-        with pytest.raises(RecordingError, match=words):
-            recover_leftovers(tmp_path)
 
 
 def test_two_at_a_time_finish_each_leftover_once(part: Path) -> None:
@@ -626,15 +556,3 @@ def test_a_whole_file_is_on_the_disk_before_it_has_its_name(
         act(tmp_path)
         assert done == ['fsync', 'replace', 'folder']
         done.clear()
-
-
-def test_a_short_write_of_a_recording_is_gone_on_with(tmp_path: Path) -> None:
-    for call in range(1, 15):
-        folder = tmp_path / str(call)
-        with (
-            Faults(MAIN, call, SHORT).active(),
-            RecordingWriter(folder, definitions=STOCK) as writer,
-        ):
-            writer.add_topic('/valve_opening', FLOAT64)
-            writer.write('/valve_opening', float64(1.5), START_NS, START_NS)
-        assert values_in(folder) == [1.5]

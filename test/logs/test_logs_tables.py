@@ -183,13 +183,6 @@ def test_date_and_time_in_two_columns(tmp_path, named):
 # Cells -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('separator', [',', ';', '\t'])
-def test_separators_and_a_mark_of_the_encoding(tmp_path, separator):
-    lines = [line.replace(',', separator) for line in timed(1, 2)]
-    path = csv(tmp_path, lines, HEADER.replace(',', separator), 'utf-8-sig')
-    assert read_table(path).columns[PRESSURE].tolist() == [13, 13]
-
-
 def test_a_decimal_comma_beside_semicolons(tmp_path):
     lines = ['1;50,5;16,25;538;600', '2;50.5;"16,25";;-1,5e2', '3;x;1.234,5;538;600']
     raw = read(tmp_path, *lines, head=HEADER.replace(',', ';'))

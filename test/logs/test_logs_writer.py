@@ -33,7 +33,6 @@ from mcap.reader import make_reader
 
 from valveflow_ros.errors import DataError, InputError, RecordingError
 from valveflow_ros.logs import (
-    LATCHED,
     Message,
     RecordingWriter,
     open_log,
@@ -173,40 +172,11 @@ def test_only_the_owner_may_look(tmp_path):
     assert modes_in(path.parent.parent) | modes_in(tmp_path) == {0o700}
 
 
-def test_an_unfinished_file_carries_another_name(tmp_path):
-    path, wanted, writer = write_chunks(tmp_path / 'log', close=False)
-    assert names_in(path.parent) == [path.name] == ['log_0.mcap.part']
-    assert len(open_log(path).readings) == len(wanted)
-    writer.close()
-    assert names_in(path.parent) == ['log_0.mcap', 'metadata.yaml']
-
-
 def test_a_folder_is_continued(tmp_path):
     (_, first, _), (_, second, _) = (write_chunks(tmp_path / 'log') for _ in range(2))
     assert names_in(tmp_path / 'log') == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
     assert len(by_rosbags(tmp_path / 'log')) == len(first) + len(second)
     assert information(tmp_path / 'log')['message_count'] == len(first) + len(second)
-
-
-def test_splits_begin_with_the_latched_messages_which_are_read_once(tmp_path):
-    folder = tmp_path / 'log'
-    curve = Message('/curve', float64(7.0), START_NS, START_NS)
-    with RecordingWriter(folder, definitions=STOCK, head_messages=lambda: [curve]) as writer:
-        writer.add_topic('/curve', FLOAT64, qos=(LATCHED,))
-        writer.add_topic('/valve_opening', FLOAT64)
-        writer.write(*curve)
-        for step in range(1, 4):
-            writer.rotate()
-            time_ns = START_NS + step * 10**9
-            writer.write('/valve_opening', float64(step), time_ns, time_ns)
-    assert writer.written == 4
-    for number in (1, 2, 3):
-        topic, log_ns, publish_ns, message = by_mcap(folder / f'log_{number}.mcap')[0]
-        assert (topic, publish_ns, message.data) == ('/curve', START_NS, 7.0)
-        assert log_ns == START_NS + number * 10**9
-    contents = open_log(folder)
-    assert [m.topic for m in contents.iter_messages()] == ['/curve', *['/valve_opening'] * 3]
-    assert contents.readings.value.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_a_topic_has_one_type_and_perhaps_a_definition_of_the_caller(tmp_path):
@@ -220,12 +190,6 @@ def test_a_topic_has_one_type_and_perhaps_a_definition_of_the_caller(tmp_path):
     [message] = contents.iter_messages()
     assert contents.decoder('/x').decode(message.data) == {'data': 3.0}
     assert contents.topics['/x'].type_hash.startswith('RIHS01_')
-
-
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
-    (tmp_path / 'file').write_text('')
-    with pytest.raises(RecordingError, match='cannot be written'):
-        RecordingWriter(tmp_path / 'file' / 'log')
 
 
 def test_an_error_within_leaves_the_file_unfinished(tmp_path):

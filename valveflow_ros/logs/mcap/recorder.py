@@ -235,53 +235,190 @@ class NewTopic(NamedTuple):
     latched: bool
 
 
-class RecorderLoop:
-    """Runs the writer in a thread; all methods but `start` may be called from other threads."""
+def free_bytes_of(folder: Path) -> int:
+    """Return the free bytes on a folder's disk; raises `OSError`."""
+    return shutil.disk_usage(folder).free
+
+
+class Recorder:
+    """Writes messages to a recording folder in a separate thread.
+
+    Unfinished files of a recorder that died are recovered first. After a disk
+    error the current file is left for `recover`, and a new one is begun when
+    writing works again. Meanwhile messages wait; if too many wait, the newest
+    are dropped and counted.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The recording's folder; created if absent, otherwise continued.
+    settings : RecorderSettings
+        Periods and limits.
+    name, definitions, attachments, metadata, open_file
+        As in `RecordingWriter`.
+    free_bytes : callable
+        Returns the free bytes on the disk of a folder.
+
+    Raises
+    ------
+    RecordingError
+        If the folder cannot be created.
+    """
 
     def __init__(
-        self, folder: Path, settings: RecorderSettings,
-        make_writer: Callable[..., RecordingWriter], counters: RecorderCounters,
-        free_bytes: Callable[[Path], int],
-    ) -> None:  # fmt: skip
-        self._folder, self._settings, self._counters = folder, settings, counters
-        self._make_writer, self._free_bytes = make_writer, free_bytes
+        self,
+        folder: str | Path,
+        settings: RecorderSettings | None = None,
+        *,
+        name: str | None = None,
+        definitions: Definitions | None = None,
+        attachments: Mapping[str, bytes] | None = None,
+        metadata: Metadata | None = None,
+        open_file: OpenFile = PartFile,
+        free_bytes: Callable[[Path], int] = free_bytes_of,
+    ) -> None:
+        self.folder = Path(folder)
+        with os_errors(self.folder, 'cannot be made'):
+            make_folder(self.folder)
+        self._settings = settings or RecorderSettings()
+        self._definitions = definitions or Definitions()
+        self._topics: dict[str, str] = {}
+        self._counters = RecorderCounters(self._settings.queue_limit)
+        self._free_bytes = free_bytes
         self._queue: deque[NewTopic | Message] = deque()
         self._latching: set[str] = set()
         self._fresh: dict[str, Message] = {}
         self._latched: dict[str, Message] = {}
+        self._make_writer = partial(
+            RecordingWriter, self.folder, name=name, definitions=self._definitions,
+            attachments=attachments, metadata=metadata, head_messages=self._latched.values,
+            open_file=open_file,
+        )  # fmt: skip
         self._writer: RecordingWriter | None = None
         self._path: Path | None = None
         self._begun_at = self._synced_at = self._retry_at = self._looked_at = 0.0
-        self._retry_wait = settings.retry_s
-        self.rotation_asked = self._stopping = False
+        self._retry_wait = self._settings.retry_s
+        self._rotation_asked = self._stopping = False
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
-        self.start = self._thread.start
+        self._thread.start()
 
-    def latched(self) -> list[Message]:
-        """Return the latched messages to repeat at the start of a new split."""
-        return list(self._latched.values())
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        qos: Sequence[Qos] = (Qos(),),
+        type_hash: str | None = None,
+        definition: str | None = None,
+        latched: bool = False,
+    ) -> None:
+        """Add a topic before its first message; adding it again changes nothing.
 
-    def put(self, item: NewTopic | Message) -> None:
-        """Queue a topic or a message."""
+        Parameters
+        ----------
+        topic, type_name : str
+            Its full name and ``package/msg/Type``.
+        qos : sequence of Qos
+            QoS profile of each of its publishers.
+        type_hash, definition : str, optional
+            By default those of `Definitions`.
+        latched : bool
+            If True, its last message is repeated at the start of every later split.
+
+        Raises
+        ------
+        InputError
+            If the topic is already recorded with another type.
+        RecordingError
+            If the definition of the type is not found or cannot be parsed.
+        """
+        known = self._topics.get(topic)
+        if known is not None:
+            if known != type_name:
+                raise InputError(f"Topic '{topic}' is recorded as {known}, not as {type_name}.")
+            return
+        text = self._definitions.text(type_name) if definition is None else definition
+        if type_hash is None:
+            try:
+                type_hash = hash_of(full_name(type_name), parse_all(type_name, text))
+            except LayoutError as error:
+                raise RecordingError(f"message type '{type_name}'", str(error)) from None
+        self._topics[topic] = type_name
+        self._put(NewTopic(topic, type_name, qos, type_hash, text, latched))
+
+    def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
+        """Queue a message of raw CDR bytes; never waits for the disk.
+
+        Returns
+        -------
+        bool
+            False if it was dropped and counted as such, because too many
+            messages are waiting or the recorder was closed.
+
+        Raises
+        ------
+        InputError
+            If the topic was not added, or a time is outside of the range of a recording.
+        """
+        if topic not in self._topics:
+            raise InputError(f"Topic '{topic}' was not made known to the recorder.")
+        if not (0 <= log_time_ns < 1 << 63 and 0 <= publish_time_ns < 1 << 63):
+            raise InputError(f"A message on '{topic}' has an impossible time.")
+        if not self._counters.admit(topic):
+            return False
+        self._put(Message(topic, data, log_time_ns, publish_time_ns))
+        return True
+
+    def flush(self, timeout_s: float) -> bool:
+        """Write all messages recorded so far to the file, where they survive a killed process.
+
+        Returns
+        -------
+        bool
+            False if they were not written within ``timeout_s`` or the recorder has stopped.
+        """
+        received = self.status().received
+        until_s = time.monotonic() + timeout_s
+        self._wake.set()
+        while (status := self.status()).received - status.queued < received:
+            if time.monotonic() >= until_s:
+                return False
+            time.sleep(_FLUSH_LOOK_S)
+        return status.state != RecorderState.STOPPED
+
+    def rotate(self) -> None:
+        """Request a new split; returns immediately."""
+        self._rotation_asked = True
+        self._wake.set()
+
+    @property
+    def is_rotating(self) -> bool:
+        """Return True if a requested split has not been begun yet."""
+        return self._rotation_asked
+
+    def status(self) -> RecorderStatus:
+        """Return all counters at one moment."""
+        return self._counters.status()
+
+    def close(self, timeout_s: float = 2.0) -> RecorderStatus:
+        """Write waiting messages and finish the file, within ``timeout_s``.
+
+        If the disk is too slow, the thread is left running and the status
+        gives the number of messages that still wait.
+        """
+        self._counters.refuse()
+        self._stopping = True
+        self._wake.set()
+        self._thread.join(timeout_s)
+        return self._counters.status()
+
+    def _put(self, item: NewTopic | Message) -> None:
         self._queue.append(item)
         if len(self._queue) >= _WAKE_AT:
             self._wake.set()
 
-    def wake(self) -> None:
-        """Write waiting messages now, before the flush period ends."""
-        self._wake.set()
-
-    def ask_rotation(self) -> None:
-        """Begin a new split at the next opportunity."""
-        self.rotation_asked = True
-        self._wake.set()
-
-    def stop(self, timeout_s: float) -> None:
-        """Finish the recording and wait at most ``timeout_s`` for it."""
-        self._stopping = True
-        self._wake.set()
-        self._thread.join(timeout_s)
+    # The following methods run in the thread.
 
     def _run(self) -> None:
         try:
@@ -344,22 +481,22 @@ class RecorderLoop:
             # Recovering a large file takes long. It must not count as a stall: a watchdog that
             # ends the node for it would do so again at every start.
             self._counters.resting()
-            self._counters.recovered(recover_leftovers(self._folder))
-            self._writer = self._make_writer(head_messages=self.latched)
+            self._counters.recovered(recover_leftovers(self.folder))
+            self._writer = self._make_writer()
         return self._writer
 
     def _check_space(self, writer: RecordingWriter) -> None:
         floor = self._settings.free_floor_bytes
         try:
-            free = self._free_bytes(self._folder)
+            free = self._free_bytes(self.folder)
         except OSError as error:
-            raise RecordingError(self._folder, f'cannot be asked for space ({error})') from None
+            raise RecordingError(self.folder, f'cannot be asked for space ({error})') from None
         if free < floor:
             # Finish the current file while there is still space for its index.
             if writer.file_bytes:
                 writer.close()
             problem = f'only {free // MIB} MiB are free, {floor // MIB} MiB must stay free'
-            raise RecordingError(self._folder, problem)
+            raise RecordingError(self.folder, problem)
 
     def _drain(self, writer: RecordingWriter) -> None:
         for _ in range(len(self._queue)):
@@ -382,7 +519,7 @@ class RecorderLoop:
             self._path, self._begun_at = writer.path, now
         old = now - self._begun_at >= self._settings.rotate_s
         large = writer.file_bytes >= self._settings.rotate_bytes
-        asked, self.rotation_asked = self.rotation_asked, False
+        asked, self._rotation_asked = self._rotation_asked, False
         if writer.file_bytes and (old or large or asked):
             writer.rotate()
             self._remove_old(writer)
@@ -395,10 +532,10 @@ class RecorderLoop:
         own = [split for split in writer.finished if is_split_of(split.name, writer.name)]
         for split in own[: max(0, len(own) - keep)]:
             try:
-                (self._folder / split.name).unlink(missing_ok=True)
+                (self.folder / split.name).unlink(missing_ok=True)
             except OSError as error:
                 problem = f'cannot be removed ({error.strerror})'
-                raise RecordingError(self._folder / split.name, problem) from None
+                raise RecordingError(self.folder / split.name, problem) from None
             writer.forget(split.name)
 
     def _count(self) -> None:
@@ -427,169 +564,3 @@ class RecorderLoop:
             reason = reason or str(error)
         self._count()
         return reason
-
-
-def free_bytes_of(folder: Path) -> int:
-    """Return the free bytes on a folder's disk; raises `OSError`."""
-    return shutil.disk_usage(folder).free
-
-
-class Recorder:
-    """Writes messages to a recording folder in a separate thread.
-
-    Unfinished files of a recorder that died are recovered first. After a disk
-    error the current file is left for `recover`, and a new one is begun when
-    writing works again. Meanwhile messages wait; if too many wait, the newest
-    are dropped and counted.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The recording's folder; created if absent, otherwise continued.
-    settings : RecorderSettings
-        Periods and limits.
-    name, definitions, attachments, metadata, open_file
-        As in `RecordingWriter`.
-    free_bytes : callable
-        Returns the free bytes on the disk of a folder.
-
-    Raises
-    ------
-    RecordingError
-        If the folder cannot be created.
-    """
-
-    def __init__(
-        self,
-        folder: str | Path,
-        settings: RecorderSettings | None = None,
-        *,
-        name: str | None = None,
-        definitions: Definitions | None = None,
-        attachments: Mapping[str, bytes] | None = None,
-        metadata: Metadata | None = None,
-        open_file: OpenFile = PartFile,
-        free_bytes: Callable[[Path], int] = free_bytes_of,
-    ) -> None:
-        self.folder = Path(folder)
-        with os_errors(self.folder, 'cannot be made'):
-            make_folder(self.folder)
-        self._settings = settings or RecorderSettings()
-        self._definitions = definitions or Definitions()
-        self._topics: dict[str, str] = {}
-        self._counters = RecorderCounters(self._settings.queue_limit)
-        make_writer = partial(
-            RecordingWriter, self.folder, name=name, definitions=self._definitions,
-            attachments=attachments, metadata=metadata, open_file=open_file,
-        )  # fmt: skip
-        self._loop = RecorderLoop(
-            self.folder, self._settings, make_writer, self._counters, free_bytes
-        )
-        self._loop.start()
-
-    def add_topic(
-        self,
-        topic: str,
-        type_name: str,
-        *,
-        qos: Sequence[Qos] = (Qos(),),
-        type_hash: str | None = None,
-        definition: str | None = None,
-        latched: bool = False,
-    ) -> None:
-        """Add a topic before its first message; adding it again changes nothing.
-
-        Parameters
-        ----------
-        topic, type_name : str
-            Its full name and ``package/msg/Type``.
-        qos : sequence of Qos
-            QoS profile of each of its publishers.
-        type_hash, definition : str, optional
-            By default those of `Definitions`.
-        latched : bool
-            If True, its last message is repeated at the start of every later split.
-
-        Raises
-        ------
-        InputError
-            If the topic is already recorded with another type.
-        RecordingError
-            If the definition of the type is not found or cannot be parsed.
-        """
-        known = self._topics.get(topic)
-        if known is not None:
-            if known != type_name:
-                raise InputError(f"Topic '{topic}' is recorded as {known}, not as {type_name}.")
-            return
-        text = self._definitions.text(type_name) if definition is None else definition
-        if type_hash is None:
-            try:
-                type_hash = hash_of(full_name(type_name), parse_all(type_name, text))
-            except LayoutError as error:
-                raise RecordingError(f"message type '{type_name}'", str(error)) from None
-        self._topics[topic] = type_name
-        self._loop.put(NewTopic(topic, type_name, qos, type_hash, text, latched))
-
-    def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Queue a message of raw CDR bytes; never waits for the disk.
-
-        Returns
-        -------
-        bool
-            False if it was dropped and counted as such, because too many
-            messages are waiting or the recorder was closed.
-
-        Raises
-        ------
-        InputError
-            If the topic was not added, or a time is outside of the range of a recording.
-        """
-        if topic not in self._topics:
-            raise InputError(f"Topic '{topic}' was not made known to the recorder.")
-        if not (0 <= log_time_ns < 1 << 63 and 0 <= publish_time_ns < 1 << 63):
-            raise InputError(f"A message on '{topic}' has an impossible time.")
-        if not self._counters.admit(topic):
-            return False
-        self._loop.put(Message(topic, data, log_time_ns, publish_time_ns))
-        return True
-
-    def flush(self, timeout_s: float) -> bool:
-        """Write all messages recorded so far to the file, where they survive a killed process.
-
-        Returns
-        -------
-        bool
-            False if they were not written within ``timeout_s`` or the recorder has stopped.
-        """
-        received = self.status().received
-        until_s = time.monotonic() + timeout_s
-        self._loop.wake()
-        while (status := self.status()).received - status.queued < received:
-            if time.monotonic() >= until_s:
-                return False
-            time.sleep(_FLUSH_LOOK_S)
-        return status.state != RecorderState.STOPPED
-
-    def rotate(self) -> None:
-        """Request a new split; returns immediately."""
-        self._loop.ask_rotation()
-
-    @property
-    def is_rotating(self) -> bool:
-        """Return True if a requested split has not been begun yet."""
-        return self._loop.rotation_asked
-
-    def status(self) -> RecorderStatus:
-        """Return all counters at one moment."""
-        return self._counters.status()
-
-    def close(self, timeout_s: float = 2.0) -> RecorderStatus:
-        """Write waiting messages and finish the file, within ``timeout_s``.
-
-        If the disk is too slow, the thread is left running and the status
-        gives the number of messages that still wait.
-        """
-        self._counters.refuse()
-        self._loop.stop(timeout_s)
-        return self._counters.status()
