@@ -10,16 +10,7 @@ from collections import Counter
 
 import pytest
 from hypothesis import example, given, settings
-from log_files import (
-    FLOAT64,
-    START_NS,
-    Told,
-    float64,
-    messages_of,
-    numbered,
-    records,
-    stock,
-)
+from log_files import FLOAT64, START_NS, float64, messages_of, numbered, records, stock
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -43,11 +34,11 @@ def path(tmp_path):
     return tmp_path / 'a.mcap'
 
 
-def read(path) -> list[Told]:
+def read(path):
     return messages_of(open_log(path))
 
 
-def in_file(raw: bytes) -> list[tuple[Told, int]]:
+def in_file(raw):
     return numbered(raw, seek=False, sort=False)
 
 
@@ -58,7 +49,7 @@ def recovered(path):
     return out, recover(path, out)
 
 
-def unchecked_sentence(kind: Kind) -> tuple[str, ...]:
+def unchecked_sentence(kind):
     """Return what is told of parts without a checksum, unless one of the whole file is right."""
     chunks, messages = kind.unchecked()
     parts = []
@@ -179,7 +170,7 @@ def test_every_option_of_the_stock_writer(path, compression, chunked):
         assert open_log(out).warnings == ()
 
 
-def ends_of_messages(raw: bytes) -> list[int]:
+def ends_of_messages(raw):
     """Return where each message outside of chunks ends."""
     return [end for op, _, end in records(raw) if op == Opcode.MESSAGE]
 

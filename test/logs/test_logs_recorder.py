@@ -31,14 +31,7 @@ from log_files import (
 )
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs import (
-    LATCHED,
-    Message,
-    Recorder,
-    RecorderState,
-    RecordingWriter,
-    open_log,
-)
+from valveflow_ros.logs import LATCHED, Message, Recorder, RecorderState, RecordingWriter, open_log
 from valveflow_ros.logs.mcap.recorder import RecorderCounters
 from valveflow_ros.logs.part_file import PartFile, is_held
 

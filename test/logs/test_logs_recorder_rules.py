@@ -7,10 +7,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections import Counter
-from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -18,12 +15,7 @@ from hypothesis import strategies as st
 from log_files import FLOAT64, STOCK
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import (
-    RecorderSettings,
-    RecorderState,
-    RecordingWriter,
-    open_log,
-)
+from valveflow_ros.logs import RecorderSettings, RecorderState, RecordingWriter, open_log
 from valveflow_ros.logs.mcap import recorder
 from valveflow_ros.logs.mcap.recorder import DROPS_SHOWN_S, RecorderCounters
 
@@ -33,28 +25,28 @@ STEP_S = 7.0
 class Clock:
     """Stands still until it is moved."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 1000.0
 
-    def monotonic(self) -> float:
+    def monotonic(self):
         return self.now
 
 
 class Writer(RecordingWriter):
     """Notes when it was called, takes its time, and fails where it is told to."""
 
-    def __init__(self, clock: Clock, folder: Path, takes_s: float = 0.0) -> None:
+    def __init__(self, clock, folder, takes_s=0.0):
         super().__init__(folder, name='log', definitions=STOCK)
         super().add_topic('/a', FLOAT64)
         self.clock, self.takes_s, self.inside = clock, takes_s, False
-        self.calls: list[tuple[str, float]] = []
-        self.bad: set[str] = set()
-        self.before: Any = lambda: None
+        self.calls = []
+        self.bad = set()
+        self.before = lambda: None
         for name in ('write', 'flush', 'sync', 'rotate', 'close', 'note', 'abandon'):
             setattr(self, name, self._noting(name, getattr(self, name)))
 
-    def _noting(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
-        def noting(*given: Any) -> Any:
+    def _noting(self, name, real):
+        def noting(*given):
             if self.inside:
                 return real(*given)
             self.before()
@@ -70,16 +62,14 @@ class Writer(RecordingWriter):
 
         return noting
 
-    def at(self, name: str) -> list[float]:
+    def at(self, name):
         return [at for called, at in self.calls if called == name]
 
 
 class Stage:
     """A recorder whose thread never runs: the test is the thread."""
 
-    def __init__(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, takes_s: float = 0.0, **given: Any
-    ) -> None:
+    def __init__(self, folder, monkeypatch, takes_s=0.0, **given):
         self.folder, self.clock = folder, Clock()
         monkeypatch.setattr(recorder, 'time', self.clock)
         monkeypatch.setattr(threading.Thread, 'start', lambda _: None)
@@ -93,36 +83,36 @@ class Stage:
         self.writer = Writer(self.clock, folder, takes_s)
         self.made = 0
 
-        def made() -> Any:
+        def made():
             self.made += 1
             return self.writer
 
         self.recorder._make_writer = made
 
-    def put(self, count: int = 1, topic: str = '/a') -> None:
+    def put(self, count=1, topic='/a'):
         for _ in range(count):
             assert self.recorder.record(topic, b'', 1, 1)
 
-    def cycle(self, stopping: bool = False) -> None:
+    def cycle(self, stopping=False):
         self.recorder._cycle(stopping)
 
-    def run_to_the_end(self) -> None:
+    def run_to_the_end(self):
         self.recorder._stopping = True
         self.recorder._run()
 
 
 @pytest.fixture
-def stage_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stage]:
+def stage_of(tmp_path, monkeypatch):
     return lambda **given: Stage(tmp_path, monkeypatch, **given)
 
 
 # --- the loop -------------------------------------------------------------------------------
 
 
-def test_each_step_of_a_cycle_is_given_a_time_of_its_own(stage_of: Any) -> None:
+def test_each_step_of_a_cycle_is_given_a_time_of_its_own(stage_of):
     """However long the steps before it took, no step begins with their time on its account."""
     stage = stage_of(takes_s=STEP_S, sync_period_s=1.0, rotate_s=0.0)
-    begun: list[tuple[float, float]] = []
+    begun = []
     stage.writer.before = lambda: begun.append(
         (stage.counters.status().stalled_s, stage.clock.now)
     )
@@ -134,13 +124,11 @@ def test_each_step_of_a_cycle_is_given_a_time_of_its_own(stage_of: Any) -> None:
     assert stage.counters.status().stalled_s == STEP_S
 
 
-def test_a_leftover_may_take_as_long_as_it_is_large(
-    stage_of: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_leftover_may_take_as_long_as_it_is_large(stage_of, monkeypatch):
     stage = stage_of()
-    seen: list[float] = []
+    seen = []
 
-    def slow(_folder: Path) -> tuple[str, ...]:
+    def slow(_folder):
         stage.clock.now += 3600.0
         seen.append(stage.counters.status().stalled_s)
         return ('report',)
@@ -158,8 +146,8 @@ def test_a_leftover_may_take_as_long_as_it_is_large(
 
 @pytest.mark.parametrize(('first', 'longest'), [(1.0, 10.0), (0.5, 0.5), (2.0, 1000.0)])
 def test_each_failure_doubles_the_wait_up_to_the_longest_and_success_forgets_it(
-    stage_of: Any, first: float, longest: float
-) -> None:
+    stage_of, first, longest
+):
     stage = stage_of(retry_s=first, retry_max_s=longest)
     expected = [min(first * 2**k, longest) for k in range(6)]
     for _ in range(2):
@@ -182,7 +170,7 @@ def test_each_failure_doubles_the_wait_up_to_the_longest_and_success_forgets_it(
         assert len(stage.writer.at('flush')) == before + 9
 
 
-def test_the_last_cycle_waits_for_no_retry(stage_of: Any) -> None:
+def test_the_last_cycle_waits_for_no_retry(stage_of):
     stage = stage_of()
     stage.writer.bad = {'flush'}
     stage.cycle()
@@ -195,13 +183,12 @@ def test_the_last_cycle_waits_for_no_retry(stage_of: Any) -> None:
 
 
 @given(
-    st.lists(st.sampled_from([0.0, 0.5, 1.0, 3.0]), max_size=40),
-    st.sampled_from([0.0, 1.0, 2.5]),
+    st.lists(st.sampled_from([0.0, 0.5, 1.0, 3.0]), max_size=40), st.sampled_from([0.0, 1.0, 2.5])
 )
 @settings(max_examples=40)
 def test_the_disk_is_asked_as_often_as_the_period_says_and_never_without_one(
-    tmp_path_factory: pytest.TempPathFactory, waits: list[float], period: float
-) -> None:
+    tmp_path_factory, waits, period
+):
     """The slow truth asks at each cycle whether the last time is a period ago."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         folder = tmp_path_factory.mktemp('log')
@@ -216,7 +203,7 @@ def test_the_disk_is_asked_as_often_as_the_period_says_and_never_without_one(
         assert stage.writer.at('sync') == expected
 
 
-def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(stage_of: Any) -> None:
+def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(stage_of):
     stage = stage_of(rotate_s=0.0, keep_files=1)
     stage.put()
     stage.cycle()
@@ -227,7 +214,7 @@ def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(stage_of:
     assert [s.name for s in stage.writer.finished] == ['log_1.mcap']
 
 
-def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(stage_of: Any) -> None:
+def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(stage_of):
     stage = stage_of()
     stage.recorder.add_topic('/curve', 'x/msg/X', definition='float64 data', latched=True)
     stage.put(2)
@@ -243,9 +230,7 @@ def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(stage_of: Any
 
 
 @pytest.mark.parametrize('bad', ['', 'note', 'close'])
-def test_at_the_end_the_account_stands_in_the_file_and_a_failure_lets_go_of_it(
-    stage_of: Any, bad: str
-) -> None:
+def test_at_the_end_the_account_stands_in_the_file_and_a_failure_lets_go_of_it(stage_of, bad):
     stage = stage_of()
     stage.put(3)
     stage.writer.bad = {bad}
@@ -262,10 +247,8 @@ def test_at_the_end_the_account_stands_in_the_file_and_a_failure_lets_go_of_it(
         assert open_log(file).metadata['valveflow_recorder'] == {'received': '3'}
 
 
-def test_what_never_began_says_that_nothing_could_be_recorded(
-    stage_of: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(_folder: Path) -> tuple[()]:
+def test_what_never_began_says_that_nothing_could_be_recorded(stage_of, monkeypatch):
+    def broken(_folder):
         raise RecordingError('log', 'cannot be read')
 
     monkeypatch.setattr(recorder, 'recover_leftovers', broken)
@@ -294,13 +277,11 @@ acts = st.lists(
 
 @given(acts, st.integers(0, 6))
 @settings(max_examples=60)
-def test_every_message_is_in_exactly_one_column_whatever_happens(
-    story: list[tuple[Any, ...]], limit: int
-) -> None:
+def test_every_message_is_in_exactly_one_column_whatever_happens(story, limit):
     """The slow truth keeps every message as one entry of a list."""
     clock = Clock()
     counters = RecorderCounters(limit, clock=clock.monotonic)
-    messages: list[str] = []
+    messages = []
     open_, since, dropped_at, state = True, None, -1e9, ('recording', '')
     for act, *more in story:
         queued = [k for k, where in enumerate(messages) if where == 'queued']

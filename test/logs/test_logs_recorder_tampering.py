@@ -31,73 +31,67 @@ from log_files import (
 )
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import (
-    Recorder,
-    RecorderStatus,
-    RecordingWriter,
-    recover,
-    recover_leftovers,
-)
+from valveflow_ros.logs import RecordingWriter, recover, recover_leftovers
 from valveflow_ros.logs.mcap import recorder as recorder_module
 
 BEFORE, AFTER = 200, 100
 Act = Callable[[Path], None]
 
 
-def unlink(path: Path) -> None:
+def unlink(path):
     path.unlink()
 
 
-def move_away(path: Path) -> None:
+def move_away(path):
     path.rename(path.with_name('kept.bin'))
 
 
-def replace_by_link(path: Path) -> None:
+def replace_by_link(path):
     other = path.parent.parent / 'other.bin'
     path.rename(other)
     path.symlink_to(other)
 
 
-def replace_by_another(path: Path) -> None:
+def replace_by_another(path):
     draft = path.with_name('draft')
     draft.write_bytes(b'something else')
     draft.replace(path)
 
 
-def empty(path: Path) -> None:
+def empty(path):
     os.truncate(path, 0)
 
 
-def halve(path: Path) -> None:
+def halve(path):
     os.truncate(path, path.stat().st_size // 2)
 
 
-def append(path: Path) -> None:
+def append(path):
     with path.open('ab') as file:
         file.write(b'log line\n')
 
 
-def overwrite(path: Path) -> None:
+def overwrite(path):
     with path.open('r+b') as file:
         file.seek(path.stat().st_size // 8)
         file.write(bytes(50))
 
 
-def overwrite_and_put_the_time_back(path: Path) -> None:
+def overwrite_and_put_the_time_back(path):
     before = path.stat()
     overwrite(path)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
-def remove_folder(path: Path) -> None:
+def remove_folder(path):
     shutil.rmtree(path.parent)
 
 
-def move_folder(path: Path) -> None:
+def move_folder(path):
     path.parent.rename(path.parent.with_name('moved'))
 
 
-def empty_folder(path: Path) -> None:
+def empty_folder(path):
     shutil.rmtree(path.parent)
     path.parent.mkdir(exist_ok=True)  # the recorder may have been quicker
 
@@ -108,14 +102,14 @@ CHANGED = (halve, overwrite, overwrite_and_put_the_time_back)
 ACTS = (*GONE, *FOLDER_ACTS, *CHANGED, replace_by_link, empty, append)
 
 
-def sequences(path: Path) -> list[int]:
+def sequences(path):
     return [number for _, number in numbered(path)]
 
 
-def found_by_stock_reader(folder: Path) -> set[int]:
+def found_by_stock_reader(folder):
     """Return what the stock reader finds in all files, those recovered that it cannot open."""
     recover_leftovers(folder)
-    found: list[int] = []
+    found = []
     for path in sorted(folder.glob('*.mcap*')):
         try:
             found += sequences(path)
@@ -128,7 +122,7 @@ def found_by_stock_reader(folder: Path) -> set[int]:
     return set(found)
 
 
-def finish(recorder: Recorder) -> RecorderStatus:
+def finish(recorder):
     """Close, and hold the account against the truth."""
     status = recorder.close(PATIENCE_S)
     assert balanced(status)
@@ -137,17 +131,17 @@ def finish(recorder: Recorder) -> RecorderStatus:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return tmp_path / 'log'
 
 
 @pytest.fixture
-def recorder(folder: Path) -> Recorder:
+def recorder(folder):
     """Return a recorder after messages in many chunks of one split."""
     return in_small_chunks(folder)
 
 
-def in_small_chunks(folder: Path) -> Recorder:
+def in_small_chunks(folder):
     made = recorder_of(folder)
     for part in range(10):
         put(made, part * BEFORE // 10, BEFORE // 10)
@@ -155,21 +149,19 @@ def in_small_chunks(folder: Path) -> Recorder:
 
 
 @pytest.fixture
-def rotated(recorder: Recorder) -> Recorder:
+def rotated(recorder):
     """Return a recorder whose only split is finished."""
     rotate(recorder)
     return recorder
 
 
-def names_the_first(folder: Path) -> bool:
+def names_the_first(folder):
     return 'log_0' in (folder / 'metadata.yaml').read_text('utf-8')
 
 
 @pytest.mark.parametrize('last', [False, True])
 @pytest.mark.parametrize('act', ACTS)
-def test_the_account_of_a_growing_file_is_what_a_reader_finds(
-    act: Act, last: bool, recorder: Recorder
-) -> None:
+def test_the_account_of_a_growing_file_is_what_a_reader_finds(act, last, recorder):
     """Also if it is changed after the last flush, where nothing but the end can notice it."""
     act(recorder.folder / 'log_0.mcap.part')
     after = 0 if last else AFTER
@@ -187,7 +179,7 @@ def test_the_account_of_a_growing_file_is_what_a_reader_finds(
 
 
 @pytest.mark.parametrize('act', ACTS)
-def test_the_account_of_finished_files_is_what_a_reader_finds(act: Act, rotated: Recorder) -> None:
+def test_the_account_of_finished_files_is_what_a_reader_finds(act, rotated):
     act(rotated.folder / 'log_0.mcap')
     if act is replace_by_link:
         # The link leads to the file, in which a reader finds all.
@@ -203,7 +195,7 @@ def test_the_account_of_finished_files_is_what_a_reader_finds(act: Act, rotated:
 
 
 @pytest.mark.parametrize('act', [unlink, overwrite])
-def test_while_it_records_it_says_so(act: Act, recorder: Recorder) -> None:
+def test_while_it_records_it_says_so(act, recorder):
     act(recorder.folder / 'log_0.mcap.part')
     wait_for(lambda: recorder.status().lost)
     lost = recorder.status().lost
@@ -211,9 +203,7 @@ def test_while_it_records_it_says_so(act: Act, recorder: Recorder) -> None:
     finish(recorder)
 
 
-def test_finished_files_are_looked_at_while_it_records(
-    rotated: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finished_files_are_looked_at_while_it_records(rotated, monkeypatch):
     monkeypatch.setattr(recorder_module, '_LOOK_S', 0.01)
     (rotated.folder / 'log_0.mcap').unlink()
     wait_for(lambda: rotated.status().removed == BEFORE)
@@ -221,7 +211,7 @@ def test_finished_files_are_looked_at_while_it_records(
     rotated.close()
 
 
-def test_a_number_is_not_given_twice(folder: Path, recorder: Recorder) -> None:
+def test_a_number_is_not_given_twice(folder, recorder):
     """Who moved a file away may bring it back."""
     part = folder / 'log_0.mcap.part'
     away = part.rename(folder.parent / part.name)
@@ -232,7 +222,7 @@ def test_a_number_is_not_given_twice(folder: Path, recorder: Recorder) -> None:
     assert len(found_by_stock_reader(folder)) == BEFORE + AFTER
 
 
-def test_a_folder_that_cannot_be_made_again_is_an_error(folder: Path, recorder: Recorder) -> None:
+def test_a_folder_that_cannot_be_made_again_is_an_error(folder, recorder):
     shutil.rmtree(folder)
     folder.write_text('a file')
     record(recorder, BEFORE, AFTER)
@@ -243,7 +233,7 @@ def test_a_folder_that_cannot_be_made_again_is_an_error(folder: Path, recorder: 
     assert finish(recorder).written == AFTER
 
 
-def test_a_file_of_the_same_name_made_meanwhile_stays(folder: Path) -> None:
+def test_a_file_of_the_same_name_made_meanwhile_stays(folder):
     """What a writer gives up it may only remove while it is its own."""
     with RecordingWriter(folder, definitions=STOCK) as writer:
         writer.add_topic('/valve_opening', FLOAT64)
@@ -255,9 +245,7 @@ def test_a_file_of_the_same_name_made_meanwhile_stays(folder: Path) -> None:
     assert (writer.written, writer.lost) == (0, 1)
 
 
-def test_a_file_that_takes_the_name_of_the_next_split_stays(
-    folder: Path, recorder: Recorder
-) -> None:
+def test_a_file_that_takes_the_name_of_the_next_split_stays(folder, recorder):
     (folder / 'log_0.mcap').write_bytes(b'something else')
     record(recorder, BEFORE, AFTER)
     status = recorder.close(PATIENCE_S)
@@ -266,7 +254,7 @@ def test_a_file_that_takes_the_name_of_the_next_split_stays(
     assert len(sequences(folder / 'log_1.mcap')) == BEFORE + AFTER
 
 
-def test_a_folder_removed_while_a_file_gets_its_name(tmp_path: Path) -> None:
+def test_a_folder_removed_while_a_file_gets_its_name(tmp_path):
     """Whatever the moment, no claim is left over."""
     for trial in range(20):
         folder = tmp_path / str(trial) / 'log'
@@ -279,7 +267,7 @@ def test_a_folder_removed_while_a_file_gets_its_name(tmp_path: Path) -> None:
         finish(recorder)
 
 
-def test_an_error_at_the_end_does_not_spare_the_last_look(folder: Path, rotated: Recorder) -> None:
+def test_an_error_at_the_end_does_not_spare_the_last_look(folder, rotated):
     put(rotated, BEFORE, AFTER)
     (folder / 'log_0.mcap').unlink()
     (folder / 'metadata.yaml').unlink()
@@ -290,9 +278,7 @@ def test_an_error_at_the_end_does_not_spare_the_last_look(folder: Path, rotated:
     assert not list(folder.glob('.*.tmp'))
 
 
-def test_what_only_recover_can_read_is_told_and_not_listed(
-    folder: Path, rotated: Recorder
-) -> None:
+def test_what_only_recover_can_read_is_told_and_not_listed(folder, rotated):
     append(folder / 'log_0.mcap')
     status = finish(rotated)
     assert (status.written, status.lost) == (BEFORE, 0)
@@ -300,7 +286,7 @@ def test_what_only_recover_can_read_is_told_and_not_listed(
     assert not names_the_first(folder)
 
 
-def test_a_removed_list_is_written_again(folder: Path, rotated: Recorder) -> None:
+def test_a_removed_list_is_written_again(folder, rotated):
     (folder / 'metadata.yaml').unlink()
     finish(rotated)
     assert names_the_first(folder)

@@ -13,9 +13,7 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -37,14 +35,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import (
-    RecordingWriter,
-    open_log,
-    part_file,
-    recover,
-    recover_leftovers,
-)
-from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder, ChunkFile, PackedChunk
+from valveflow_ros.logs import RecordingWriter, open_log, part_file, recover, recover_leftovers
+from valveflow_ros.logs.mcap.chunk_file import ChunkBuilder, ChunkFile
 from valveflow_ros.logs.mcap.records import MAGIC, TopicTable, pack
 from valveflow_ros.logs.part_file import (
     PartFile,
@@ -69,7 +61,7 @@ os._exit(0)
 
 
 @pytest.fixture(scope='module')
-def dead(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dead(tmp_path_factory):
     """Return the part that a process left that ended without a word: 400 messages, 20 chunks."""
     folder = tmp_path_factory.mktemp('dead') / 'log'
     here = Path(__file__).parent
@@ -80,20 +72,20 @@ def dead(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def part(dead: Path, tmp_path: Path) -> Path:
+def part(dead, tmp_path):
     """Return a copy of it in a folder of its own."""
     (tmp_path / 'log').mkdir()
     return Path(shutil.copy(dead, tmp_path / 'log'))
 
 
-def placed(part: Path, *numbers: int) -> list[Path]:
+def placed(part, *numbers):
     """Put further copies of a part into its folder."""
     names = [f'log_{k}.mcap.part' for k in numbers]
     return [Path(shutil.copy(part, part.with_name(name))) for name in names]
 
 
 @pytest.fixture(scope='module', autouse=True)
-def spared() -> Iterator[None]:
+def spared():
     """Spare the collector what earlier tests left: it is asked before and after each recovery."""
     gc.collect()
     gc.freeze()
@@ -101,17 +93,17 @@ def spared() -> Iterator[None]:
     gc.unfreeze()
 
 
-def open_descriptors() -> int:
+def open_descriptors():
     # What earlier tests left to the collector may go at any moment.
     gc.collect()
     return len(os.listdir('/proc/self/fd'))
 
 
-def names_in(folder: Path) -> list[str]:
+def names_in(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-def listed(folder: Path) -> dict[str, int]:
+def listed(folder):
     """Return the files that the folder's list names, with their messages."""
     text = (folder / 'metadata.yaml').read_text()
     info = yaml.safe_load(text)['rosbag2_bagfile_information']
@@ -121,10 +113,10 @@ def listed(folder: Path) -> dict[str, int]:
 # --- recovery -------------------------------------------------------------------------------
 
 
-def test_an_unfinished_file_becomes_one_that_stock_readers_open(tmp_path: Path) -> None:
+def test_an_unfinished_file_becomes_one_that_stock_readers_open(tmp_path):
     part, wanted = write_part(tmp_path / 'log')
     out = tmp_path / 'new' / 'whole.mcap'
-    steps: list[tuple[int, int]] = []
+    steps = []
     report = recover(part, out, progress=lambda *step: steps.append(step))
     raw = part.read_bytes()
     assert (report.messages, report.chunks, report.damaged_chunks) == (len(wanted), 20, 0)
@@ -140,9 +132,7 @@ def test_an_unfinished_file_becomes_one_that_stock_readers_open(tmp_path: Path) 
     assert read_back(open_log(out)) == wanted
 
 
-def test_chunks_are_copied_as_they_are_and_recovering_again_changes_nothing(
-    tmp_path: Path,
-) -> None:
+def test_chunks_are_copied_as_they_are_and_recovering_again_changes_nothing(tmp_path):
     first, _, _ = write_chunks(tmp_path / 'log')
     for source, out in ((first, 'b.mcap'), (tmp_path / 'b.mcap', 'c.mcap')):
         recover(source, tmp_path / out)
@@ -158,14 +148,14 @@ def test_chunks_are_copied_as_they_are_and_recovering_again_changes_nothing(
 
 
 @pytest.mark.parametrize('content', [b'', MAGIC, bytes(4000)])
-def test_where_nothing_is_intact_nothing_is_made(tmp_path: Path, content: bytes) -> None:
+def test_where_nothing_is_intact_nothing_is_made(tmp_path, content):
     (tmp_path / 'bad.mcap').write_bytes(content)
     with pytest.raises(RecordingError, match=r'\.$'):
         recover(tmp_path / 'bad.mcap', tmp_path / 'out.mcap')
     assert names_in(tmp_path) == ['bad.mcap']
 
 
-def test_what_stands_in_the_way_of_the_output_is_kept(part: Path, tmp_path: Path) -> None:
+def test_what_stands_in_the_way_of_the_output_is_kept(part, tmp_path):
     before = part.read_bytes()
     with pytest.raises(RecordingError, match='exists already'):
         recover(part, part)
@@ -184,20 +174,18 @@ def test_what_stands_in_the_way_of_the_output_is_kept(part: Path, tmp_path: Path
     assert len(open_log(tmp_path / 'b.mcap').readings) == 400
 
 
-def chunk(number: int, topic: str) -> PackedChunk:
+def chunk(number, topic):
     """Return a chunk of one message, with the tables it needs."""
     builder = ChunkBuilder()
     builder.add(1, number, START_NS + number, START_NS + number, float64(number))
     return builder.build(pack(*topics(topic)))
 
 
-def topics(topic: str) -> tuple[Schema, Channel]:
+def topics(topic):
     return Schema(1, b'float64 data', 'ros2msg', FLOAT64), Channel(1, topic, 'cdr', {}, 1)
 
 
-def test_a_chunk_that_contradicts_an_earlier_one_is_left_out_counted_and_told(
-    tmp_path: Path,
-) -> None:
+def test_a_chunk_that_contradicts_an_earlier_one_is_left_out_counted_and_told(tmp_path):
     """Its checksum is right, but its message would be taken for one of another topic."""
     file = ChunkFile(PartFile(tmp_path / 'a.mcap'), 'test')
     for k, topic in enumerate(['/valve_opening', '/other', '/valve_opening']):
@@ -212,9 +200,7 @@ def test_a_chunk_that_contradicts_an_earlier_one_is_left_out_counted_and_told(
 
 
 @pytest.mark.parametrize('topic', ['/valve_opening', '/other'])
-def test_a_summary_adds_the_topics_that_no_chunk_names_or_the_file_is_refused(
-    tmp_path: Path, topic: str
-) -> None:
+def test_a_summary_adds_the_topics_that_no_chunk_names_or_the_file_is_refused(tmp_path, topic):
     """Where chunk and summary give one channel two names, neither is believed."""
     file = ChunkFile(PartFile(tmp_path / 'a.mcap'), 'test')
     file.put_chunk(chunk(0, '/valve_opening'))
@@ -233,7 +219,7 @@ def test_a_summary_adds_the_topics_that_no_chunk_names_or_the_file_is_refused(
     assert open_descriptors() == before
 
 
-def test_an_output_that_fails_half_way_leaves_nothing(part: Path, tmp_path: Path) -> None:
+def test_an_output_that_fails_half_way_leaves_nothing(part, tmp_path):
     before, calls = open_descriptors(), 0
     for call in range(1, 80):
         out = tmp_path / f'out{call}' / 'b.mcap'
@@ -257,7 +243,7 @@ def test_an_output_that_fails_half_way_leaves_nothing(part: Path, tmp_path: Path
 # --- leftovers ------------------------------------------------------------------------------
 
 
-def test_leftovers_of_the_dead_are_finished(part: Path) -> None:
+def test_leftovers_of_the_dead_are_finished(part):
     """Each is finished on its own, one that is in use or damaged stays, and others are no file."""
     folder = part.parent
     placed(part, 2, 5)
@@ -285,7 +271,7 @@ def test_leftovers_of_the_dead_are_finished(part: Path) -> None:
 
 
 @pytest.mark.parametrize('call', range(1, 41))
-def test_wherever_a_recovery_fails_the_next_one_completes_it(part: Path, call: int) -> None:
+def test_wherever_a_recovery_fails_the_next_one_completes_it(part, call):
     """All messages stand in the part or in the whole file at every moment, never in neither."""
     folder, parts = part.parent, [part, *placed(part, 3)]
     before = open_descriptors()
@@ -309,7 +295,7 @@ def test_wherever_a_recovery_fails_the_next_one_completes_it(part: Path, call: i
     assert not any(folder.glob('*.part'))
 
 
-def test_a_folder_without_leftovers_is_not_touched(tmp_path: Path) -> None:
+def test_a_folder_without_leftovers_is_not_touched(tmp_path):
     folder = tmp_path / 'log'
     write_chunks(folder)
     (folder / 'metadata.yaml').write_text('mine')
@@ -318,7 +304,7 @@ def test_a_folder_without_leftovers_is_not_touched(tmp_path: Path) -> None:
     assert {p: p.stat().st_mtime_ns for p in folder.iterdir()} == times
 
 
-def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(part: Path) -> None:
+def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(part):
     raw = bytearray(part.read_bytes()[:3000])
     for place in range(200, len(raw), 50):
         raw[place] ^= 255
@@ -331,7 +317,7 @@ def test_what_cannot_be_recovered_stays_and_does_not_stop_a_recorder(part: Path)
     assert part.read_bytes() == raw
 
 
-def test_a_part_whose_only_chunk_was_begun_goes(part: Path) -> None:
+def test_a_part_whose_only_chunk_was_begun_goes(part):
     """What was never whole was never counted as written; a damaged chunk stays for its owner."""
     raw = part.read_bytes()
     first = next(begin for op, begin, _ in records(raw) if op == Opcode.CHUNK)
@@ -344,11 +330,11 @@ def test_a_part_whose_only_chunk_was_begun_goes(part: Path) -> None:
         assert part.exists() == (content is damaged), len(content)
 
 
-def test_two_at_a_time_finish_each_leftover_once(part: Path) -> None:
+def test_two_at_a_time_finish_each_leftover_once(part):
     placed(part, 1, 2, 3)
-    found: list[int] = []
+    found = []
 
-    def work() -> None:
+    def work():
         found.extend(report.messages for report in recover_leftovers(part.parent))
 
     threads = [threading.Thread(target=work) for _ in range(3)]
@@ -364,11 +350,11 @@ def test_two_at_a_time_finish_each_leftover_once(part: Path) -> None:
 # --- files ----------------------------------------------------------------------------------
 
 
-def mode(path: Path) -> int:
+def mode(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_every_folder_that_is_made_is_its_owners_and_others_stay(tmp_path: Path) -> None:
+def test_every_folder_that_is_made_is_its_owners_and_others_stay(tmp_path):
     (tmp_path / 'there').mkdir()
     (tmp_path / 'there').chmod(0o755)
     before = os.umask(0)
@@ -378,9 +364,7 @@ def test_every_folder_that_is_made_is_its_owners_and_others_stay(tmp_path: Path)
     assert [mode(tmp_path / 'there' / p) for p in ('.', 'a', 'a/b')] == [0o755, 0o700, 0o700]
 
 
-def test_a_folder_that_another_makes_at_the_same_moment_is_as_good(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_another_makes_at_the_same_moment_is_as_good(tmp_path, monkeypatch):
     """Between looking and making, each folder on the way may have come into being."""
     (tmp_path / 'a' / 'b').mkdir(parents=True)
     monkeypatch.setattr(os.path, 'isdir', lambda _path: False)
@@ -391,11 +375,11 @@ def test_a_folder_that_another_makes_at_the_same_moment_is_as_good(
         make_folder(tmp_path / 'file')
 
 
-def small(folder: Path) -> None:
+def small(folder):
     write_whole(folder / 'small', b'new and longer')
 
 
-def whole_part(folder: Path) -> None:
+def whole_part(folder):
     (folder / 'a.mcap').unlink(missing_ok=True)
     file = PartFile(folder / 'a.mcap')
     try:
@@ -406,21 +390,19 @@ def whole_part(folder: Path) -> None:
         file.close()
 
 
-def look(folder: Path) -> None:
+def look(folder):
     (folder / 'b.mcap.part').write_bytes(b'')
     is_held(folder / 'b.mcap.part')
 
 
-def again(folder: Path) -> None:
+def again(folder):
     (folder / 'c.mcap.part').write_bytes(b'left')
     PartFile(folder / 'c.mcap', replace=True).discard()
 
 
 @pytest.mark.parametrize('act', [small, whole_part, look, again, sync_folder])
 @pytest.mark.parametrize('error', [errno.EIO, errno.ENOSPC])
-def test_no_failure_keeps_a_descriptor_or_a_draft(
-    tmp_path: Path, act: Callable[[Path], None], error: int
-) -> None:
+def test_no_failure_keeps_a_descriptor_or_a_draft(tmp_path, act, error):
     before, failed = open_descriptors(), 0
     for call in range(1, 12):
         (tmp_path / 'small').write_bytes(b'old')
@@ -439,9 +421,7 @@ def test_no_failure_keeps_a_descriptor_or_a_draft(
     assert failed > 0
 
 
-def test_a_small_file_is_whole_however_little_a_write_takes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_file_is_whole_however_little_a_write_takes(tmp_path, monkeypatch):
     write = os.write
     monkeypatch.setattr(part_file.os, 'write', lambda d, data: write(d, bytes(data)[:3]))
     for size in (0, 1, 3, 4, 100):
@@ -449,7 +429,7 @@ def test_a_small_file_is_whole_however_little_a_write_takes(
         assert (tmp_path / 'small').read_bytes() == bytes(range(size))
     assert names_in(tmp_path) == ['small']
 
-    def full(descriptor: int, data: bytes) -> int:
+    def full(descriptor, data):
         write(descriptor, bytes(data)[:1])
         raise OSError(errno.ENOSPC, 'No space left on device')
 
@@ -460,7 +440,7 @@ def test_a_small_file_is_whole_however_little_a_write_takes(
     assert (tmp_path / 'small').read_bytes() == bytes(range(100))
 
 
-def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
+def test_nothing_is_written_through_a_link(tmp_path):
     (tmp_path / 'victim').write_bytes(b'not ours')
     draft = tmp_path / f'.small.{os.getpid()}.{threading.get_ident()}.tmp'
     for link in (tmp_path / 'a.mcap.part', draft):
@@ -474,7 +454,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     assert (tmp_path / 'victim').read_bytes() == b'not ours'
 
 
-def test_a_pipe_in_the_place_of_a_part_makes_nobody_wait(tmp_path: Path) -> None:
+def test_a_pipe_in_the_place_of_a_part_makes_nobody_wait(tmp_path):
     os.mkfifo(tmp_path / 'a.mcap.part')
     done = threading.Thread(target=lambda: is_held(tmp_path / 'a.mcap.part'), daemon=True)
     done.start()
@@ -483,7 +463,7 @@ def test_a_pipe_in_the_place_of_a_part_makes_nobody_wait(tmp_path: Path) -> None
     assert recover_leftovers(tmp_path) == ()
 
 
-def test_a_part_is_held_by_one_at_a_time_until_it_is_let_go(tmp_path: Path) -> None:
+def test_a_part_is_held_by_one_at_a_time_until_it_is_let_go(tmp_path):
     file = PartFile(tmp_path / 'a.mcap')
     file.write(b'mine')
     assert is_held(file.part)
@@ -504,12 +484,10 @@ def test_a_part_is_held_by_one_at_a_time_until_it_is_let_go(tmp_path: Path) -> N
         is_held(file.part)
 
 
-def test_a_part_removed_between_making_and_locking_is_made_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_removed_between_making_and_locking_is_made_again(tmp_path, monkeypatch):
     lock, left = fcntl.flock, [2]
 
-    def raced(descriptor: int, how: int) -> None:
+    def raced(descriptor, how):
         lock(descriptor, how)
         if left[0]:
             left[0] -= 1
@@ -526,7 +504,7 @@ def test_a_part_removed_between_making_and_locking_is_made_again(
         PartFile(tmp_path / 'a.mcap')
     assert open_descriptors() == before
 
-    def broken(_descriptor: int, _how: int) -> None:
+    def broken(_descriptor, _how):
         raise OSError(errno.ENOLCK, 'No locks available')
 
     monkeypatch.setattr(part_file.fcntl, 'flock', broken)
@@ -535,18 +513,16 @@ def test_a_part_removed_between_making_and_locking_is_made_again(
     assert open_descriptors() == before
 
 
-def test_a_whole_file_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_whole_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     """Data, then name, then the folder that holds the name: in that order, each time."""
-    done: list[str] = []
+    done = []
     fsync, replace = os.fsync, os.replace
 
-    def synced(descriptor: int) -> None:
+    def synced(descriptor):
         done.append('folder' if stat.S_ISDIR(os.fstat(descriptor).st_mode) else 'fsync')
         fsync(descriptor)
 
-    def replaced(*given: Any) -> None:
+    def replaced(*given):
         done.append('replace')
         replace(*given)
 

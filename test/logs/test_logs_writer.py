@@ -32,13 +32,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from valveflow_ros.errors import DataError, InputError, RecordingError
-from valveflow_ros.logs import (
-    Message,
-    RecordingWriter,
-    open_log,
-    write_samples,
-    write_table,
-)
+from valveflow_ros.logs import Message, RecordingWriter, open_log, write_samples, write_table
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
 AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader

@@ -303,7 +303,7 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     Opcodes unknown to the format are skipped. Raises `LayoutError` if a record is cut off, or of
     a kind that is not allowed in a chunk.
     """
-    starts, others = _boundaries(content)
+    starts, others, _ = _boundaries(content)
     heads = rows(content, HEAD_DTYPE, 0, starts)
     fields = ('channel', 'sequence', 'log_time', 'publish_time')
     columns = [np.ascontiguousarray(heads[name]) for name in fields]
@@ -316,22 +316,10 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
 
 def leading_messages(content: bytes) -> tuple[int, int]:
     """Return the number of messages at the beginning of ``content``, and where they end."""
-    starts: list[int] = []
-    position, end, probe = 0, len(content), True
-    unpack = RECORD_HEAD.unpack_from
-    while position + HEAD_SIZE <= end:
-        op, length = unpack(content, position)
-        after = position + RECORD_HEAD.size + length
-        if op != 5 or length < MESSAGE_HEAD.size or after > end:
-            break
-        count = _run(content, position, after - position) if probe else 1
-        probe = count >= RUN_PROBE
-        last = position + count * (after - position)
-        starts += range(position, last, after - position)
-        position = last
-    heads = rows(content, HEAD_DTYPE, 0, np.array(starts, dtype=np.int64))
+    starts, _, end = _boundaries(content, leading=True)
+    heads = rows(content, HEAD_DTYPE, 0, starts)
     late = np.flatnonzero((heads['log_time'] < 0) | (heads['publish_time'] < 0))
-    return (int(late[0]), starts[late[0]]) if len(late) else (len(starts), position)
+    return (int(late[0]), int(starts[late[0]])) if len(late) else (len(starts), end)
 
 
 def rows(
@@ -373,7 +361,13 @@ def _evenly(starts: IntArray) -> list[tuple[int, int, int]] | None:
     ]
 
 
-def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
+def _boundaries(
+    content: bytes, leading: bool = False
+) -> tuple[IntArray, list[tuple[int, bytes]], int]:
+    """Return where messages begin, the schema and channel records, and the end.
+
+    If only ``leading`` messages are wanted, the end is before anything else.
+    """
     parts: list[IntArray] = []
     singles: list[int] = []
     others: list[tuple[int, bytes]] = []
@@ -383,6 +377,8 @@ def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
         whole = position + RECORD_HEAD.size <= end
         op, length = unpack(content, position) if whole else (0, end)
         after = position + RECORD_HEAD.size + length
+        if leading and (op != 5 or length < MESSAGE_HEAD.size or after > end):
+            break
         if after > end:
             raise LayoutError('a chunk ends in the middle of a record')
         if op == 5:
@@ -405,7 +401,7 @@ def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
         elif op < FIRST_FOREIGN:
             raise LayoutError(f'a chunk holds a record of kind {op}')
         position = after
-    return np.concatenate([*parts, np.array(singles, dtype=np.int64)]), others
+    return np.concatenate([*parts, np.array(singles, dtype=np.int64)]), others, position
 
 
 def _run(content: bytes, position: int, stride: int) -> int:

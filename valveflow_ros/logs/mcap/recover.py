@@ -186,11 +186,7 @@ def _holds_nothing(part: Path) -> bool:
 
 
 def _recover(
-    path: Path,
-    target: Path,
-    name: str,
-    progress: Progress | None = None,
-    proven: bool = False,
+    path: Path, target: Path, name: str, progress: Progress | None = None, proven: bool = False
 ) -> RecoveryReport:
     with Source.open(path) as source:
         scanner = Scanner(source)

@@ -21,13 +21,7 @@ from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_has
 from valveflow_ros.logs.mcap.folder import METADATA_NAME, Split, finished_splits
 from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
 from valveflow_ros.logs.mcap.recover import intact_messages
-from valveflow_ros.logs.part_file import (
-    PART_SUFFIX,
-    AlteredError,
-    PartFile,
-    make_folder,
-    mark_of,
-)
+from valveflow_ros.logs.part_file import PART_SUFFIX, AlteredError, PartFile, make_folder, mark_of
 from valveflow_ros.logs.source import os_errors
 
 # rosbag2 writes the longest duration of ROS 2 for "no limit".

@@ -20,13 +20,7 @@ from valveflow_ros.logs.tables.cells import Marks, to_numbers
 from valveflow_ros.logs.tables.file import TableFile, look_at
 from valveflow_ros.logs.tables.match import TIME, Matcher, stamps_in, time_columns, zone_in
 from valveflow_ros.logs.tables.reader import cells_of, time_cells, time_samples
-from valveflow_ros.logs.tables.refusal import (
-    AS_SEEN,
-    THEIRS,
-    RefusedError,
-    Remedy,
-    TableOptions,
-)
+from valveflow_ros.logs.tables.refusal import AS_SEEN, THEIRS, RefusedError, Remedy, TableOptions
 from valveflow_ros.logs.tables.times import NEVER, RowClock, TimeReader
 from valveflow_ros.logs.tables.words import folded, split_unit
 from valveflow_ros.records import FloatArray, IntArray

@@ -180,14 +180,14 @@ class LocalClock:
             winter = stamps.dt.tz_localize(self._zone, ambiguous=False, nonexistent='raise')
         except Exception as error:
             raise self._nonexistent(stamps) from error
-        first, second = _utc(summer), _utc(winter)
+        first, second = from_stamps(summer), from_stamps(winter)
         twice = (first != second) & ~missing
         if not twice.any():
             known = stamps[~missing]
             if len(known):
                 self._last, self._second = None, False
             return summer.dt.tz_convert('UTC')
-        later = self._later(_local(stamps), twice)
+        later = self._later(from_stamps(stamps), twice)
         self.folded += int(twice.sum())
         ns = pd.Series(np.where(later, second, first)).where(~missing)
         return pd.to_datetime(ns, unit='ns', utc=True)
@@ -228,15 +228,6 @@ class LocalClock:
             f'clock was set forward then; the clock of the file was not. Use {zone}',
             [zone],
         )
-
-
-def _utc(stamps: pd.Series[Any]) -> IntArray:
-    return _local(stamps.dt.tz_convert('UTC').dt.tz_localize(None))
-
-
-def _local(stamps: pd.Series[Any]) -> IntArray:
-    local: IntArray = stamps.to_numpy().astype('datetime64[ns]').astype(np.int64)
-    return local
 
 
 _WHOLE_LIMIT = 2.0**63
