@@ -7,7 +7,6 @@ import sys
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import yaml
@@ -32,7 +31,7 @@ from log_files import (
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import LATCHED, Message, Recorder, RecorderState, RecordingWriter, open_log
-from valveflow_ros.logs.mcap.recorder import RecorderCounters
+from valveflow_ros.logs.mcap import recorder as recorder_module
 from valveflow_ros.logs.part_file import PartFile, is_held
 
 
@@ -252,27 +251,19 @@ def test_the_oldest_files_go_when_told_so(folder):
 
 
 def test_an_old_file_that_cannot_be_removed_is_said_and_recording_goes_on(folder, monkeypatch):
-    recorder = recorder_of(folder, replace(QUICK, keep_files=1))
-    stuck, said = [True], []
-    unlink, ill = Path.unlink, RecorderCounters.failing
-    # It is said for two milliseconds, which is long enough only for who listens.
-    monkeypatch.setattr(
-        RecorderCounters, 'failing', lambda counters, why: (said.append(why), ill(counters, why))
-    )
-
-    def sticky(path, missing_ok=False):
-        if stuck and path.name.endswith('_0.mcap'):
-            raise PermissionError(errno.EPERM, 'Operation not permitted')
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, 'unlink', sticky)
-    for k in range(2):
-        put(recorder, k)
-        rotate(recorder)
-    wait_for(lambda: said)
-    assert 'cannot be removed (Operation not permitted)' in said[0]
-    put(recorder, 2)
-    stuck.clear()
+    monkeypatch.setattr(recorder_module, '_LOOK_S', 600.0)
+    # A retry so late that what is said can be seen.
+    recorder = recorder_of(folder, replace(QUICK, keep_files=1, retry_s=0.5, retry_max_s=0.5))
+    put(recorder, 0)
+    rotate(recorder)
+    old = folder / 'log_0.mcap'
+    old.unlink()
+    old.mkdir()
+    record(recorder, 1)
+    rotate(recorder)
+    wait_for(lambda: 'cannot be removed (Is a directory)' in recorder.status().reason)
+    old.rmdir()
+    record(recorder, 2)
     rotate(recorder)
     recorder.close()
     assert values_in(folder) == [2]

@@ -345,11 +345,9 @@ class TableReader:
                 places[name] = names.index(own)
                 continue
             place = cell_values.quality_column(chosen.theirs, names)
-            if (
-                place is not None
-                and place not in used
-                and understands(cells_of(self._file, place))
-            ):
+            if place is None or place in used:
+                continue
+            if understands(cells_of(self._file, place)):
                 places[name] = place
         return places
 
