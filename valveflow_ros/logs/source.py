@@ -76,31 +76,16 @@ class Source(AbstractContextManager['Source']):
         self.stream.close()
 
 
+# Limits that a reader keeps, whatever sizes a file claims.
 MIB = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits that a reader keeps, whatever sizes a file claims.
-
-    The limits on work grow with the file size, because data of a plant are
-    compressed about ten times at most. ``work_floor_bytes + work_per_byte * size``
-    bytes may be decompressed in total, and ``failed_floor_bytes + failed_per_byte *
-    size`` bytes without a usable result.
-    """
-
-    record_bytes: int = 64 * MIB
-    chunk_bytes: int = 32 * MIB
-    channels: int = 1024
-    definition_bytes: int = 4 * MIB
-    attachment_bytes: int = 64 * MIB
-    work_floor_bytes: int = 32 * MIB
-    work_per_byte: int = 64
-    failed_floor_bytes: int = 128 * MIB
-    failed_per_byte: int = 2
-
-
-DEFAULT_LIMITS = Limits()
+RECORD_BYTES = ATTACHMENT_BYTES = 64 * MIB
+CHUNK_CONTENT_BYTES = 32 * MIB
+DEFINITION_BYTES = 4 * MIB
+MOST_TOPICS = 1024
+# The limits on work are so much, and more for each byte of the file, because data of a plant are
+# compressed about ten times at most: what is decompressed in total, and without a usable result.
+_WORK_BYTES = (32 * MIB, 64)
+_FAILED_BYTES = (128 * MIB, 2)
 
 
 class OverBudgetError(Exception):
@@ -112,18 +97,18 @@ class Budget:
 
     __slots__ = ('failed_left', 'left')
 
-    def __init__(self, file_bytes: int, limits: Limits = DEFAULT_LIMITS) -> None:
-        self.left = limits.work_floor_bytes + limits.work_per_byte * file_bytes
-        self.failed_left = limits.failed_floor_bytes + limits.failed_per_byte * file_bytes
+    def __init__(self, file_bytes: int) -> None:
+        self.left = _WORK_BYTES[0] + _WORK_BYTES[1] * file_bytes
+        self.failed_left = _FAILED_BYTES[0] + _FAILED_BYTES[1] * file_bytes
 
-    def spend(self, size: int) -> None:
-        """Count work before it is done; raises `OverBudgetError` beyond the limit."""
-        self.left -= size
-        if self.left < 0:
-            raise OverBudgetError
+    def spend(self, size: int, in_vain: bool = False) -> None:
+        """Count work before it is done, or work without a usable result.
 
-    def spend_in_vain(self, size: int) -> None:
-        """Count work without a usable result; raises `OverBudgetError` beyond the limit."""
-        self.failed_left -= size
-        if self.failed_left < 0:
+        Raises `OverBudgetError` beyond the limit.
+        """
+        if in_vain:
+            self.failed_left -= size
+        else:
+            self.left -= size
+        if min(self.left, self.failed_left) < 0:
             raise OverBudgetError

@@ -44,7 +44,7 @@ from valveflow_ros.logs.mcap.scan import (
 )
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
-from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
+from valveflow_ros.logs.source import RECORD_BYTES, OverBudgetError, Source
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 
 # A monitor publishes its state again within a day, so older messages are not needed.
@@ -218,7 +218,7 @@ class Follower:
         if not known or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
             return self._beyond_damage(source)
         if after > source.size:
-            if self.written and length <= DEFAULT_LIMITS.record_bytes:
+            if self.written and length <= RECORD_BYTES:
                 return None
             return self._beyond_damage(source, sure=False)
         if op in (Opcode.CHUNK, Opcode.MESSAGE):

@@ -29,7 +29,7 @@ from valveflow_ros.logs.mcap.records import (
 )
 from valveflow_ros.logs.mcap.scan import Chunk, Findings, Scanner
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, TopicChoice
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
+from valveflow_ros.logs.source import Source
 from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
 
 _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
@@ -137,15 +137,15 @@ def _merged(parts: list[Placed]) -> Rows:
 GROUP_BYTES = 4 << 20
 
 
-def gather(source: Source, choice: TopicChoice, limits: Limits = DEFAULT_LIMITS) -> FileContents:
+def gather(source: Source, choice: TopicChoice) -> FileContents:
     """Return the contents of one file.
 
     Raises `RecordingError` if the file contradicts itself or exceeds a limit.
     """
     summary = read_summary(source)
-    seed = TopicTable(limits) if summary is None else summary.table
+    seed = TopicTable() if summary is None else summary.table
     while True:
-        collector = _Collector(source, choice, seed, Scanner(source, limits))
+        collector = _Collector(source, choice, seed, Scanner(source))
         contents = collector.run()
         if not collector.unnamed & collector.known and not contents.table.replaced:
             break
@@ -161,7 +161,7 @@ class _Collector:
     def __init__(
         self, source: Source, choice: TopicChoice, seed: TopicTable, scanner: Scanner
     ) -> None:
-        self.contents = FileContents(source.path, TopicTable(seed.limits), scanner.findings)
+        self.contents = FileContents(source.path, TopicTable(), scanner.findings)
         self.known: set[int] = set()
         self.unnamed: set[int] = set()
         self._choice = choice

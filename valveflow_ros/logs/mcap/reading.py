@@ -264,8 +264,10 @@ def _timed(found: tuple[Readings, IntArray]) -> tuple[tuple[Readings, IntArray],
     if not len(readings) or readings.time_ns.min() > 0 or readings.time_ns.max() <= 0:
         return found, []
     timed = readings.time_ns > 0
-    columns = readings.time_ns, readings.signal, readings.value, readings.quality
-    kept = Readings(*(column[timed] for column in columns))
+    kept = Readings(
+        readings.time_ns[timed], readings.signal[timed], readings.value[timed],
+        readings.quality[timed],
+    )  # fmt: skip
     lost = counted(len(readings) - len(kept), 'value')
     told = f'{lost} recorded without a time, as before the first /clock, left out.'
     return (kept, log_time[timed]), [told]

@@ -27,7 +27,7 @@ from mcap.records import Attachment, Channel, Footer, McapRecord, Schema, Statis
 from mcap.well_known import SchemaEncoding
 from numpy.typing import NDArray
 
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
+from valveflow_ros.logs.source import DEFINITION_BYTES, MOST_TOPICS, RECORD_BYTES, Source
 from valveflow_ros.records import IntArray
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -128,7 +128,6 @@ class TopicTable:
     a checksum differs from them (``replaced``).
     """
 
-    limits: Limits = DEFAULT_LIMITS
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     definition_bytes: int = 0
@@ -185,10 +184,10 @@ class TopicTable:
     def _check_size(self, count: int, record: Schema | Channel) -> None:
         if isinstance(record, Schema):
             self.definition_bytes += len(record.data)
-            if self.definition_bytes > self.limits.definition_bytes:
+            if self.definition_bytes > DEFINITION_BYTES:
                 raise LayoutError('its definitions of messages are larger than can be read')
-        if count >= self.limits.channels:
-            raise LayoutError(f'it has more than {self.limits.channels} topics')
+        if count >= MOST_TOPICS:
+            raise LayoutError(f'it has more than {MOST_TOPICS} topics')
 
 
 def definition(op: int, content: bytes) -> Schema | Channel | None:
@@ -226,7 +225,7 @@ def read_summary(source: Source) -> Summary | None:
     raw_footer = source.read(footer_at, FOOTER_SIZE)
     footer = unpack(Footer.read, raw_footer[RECORD_HEAD.size :])
     size = footer_at - footer.summary_start
-    if footer.summary_start == 0 or not 0 < size <= DEFAULT_LIMITS.record_bytes:
+    if footer.summary_start == 0 or not 0 < size <= RECORD_BYTES:
         return None
     raw = source.read(footer.summary_start, size)
     checked = zlib.crc32(raw_footer[:-4], zlib.crc32(raw)) == footer.summary_crc
@@ -305,10 +304,12 @@ def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     """
     starts, others, _ = _boundaries(content)
     heads = rows(content, HEAD_DTYPE, 0, starts)
-    fields = ('channel', 'sequence', 'log_time', 'publish_time')
-    columns = [np.ascontiguousarray(heads[name]) for name in fields]
+    channel, sequence, log_time, publish_time = (
+        np.ascontiguousarray(heads[name])
+        for name in ('channel', 'sequence', 'log_time', 'publish_time')
+    )
     sizes = heads['length'].astype(np.int64) - MESSAGE_HEAD.size
-    table = MessageTable(*columns, starts, sizes)
+    table = MessageTable(channel, sequence, log_time, publish_time, starts, sizes)
     if len(table) and min(table.log_time.min(), table.publish_time.min()) < 0:
         raise LayoutError('a message claims a time after the year 2262')
     return table, others

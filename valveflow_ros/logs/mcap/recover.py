@@ -196,7 +196,9 @@ def _recover(
         if first is None:
             why = scan.why_empty(scanner.findings)
             raise RecordingError(path, f'{why}; nothing was recovered')
-        kind = partial(_ProvenFile, source=path) if proven else PartFile
+        kind: Callable[..., PartFile] = PartFile
+        if proven:
+            kind = partial(_ProvenFile, source=path)
         with os_errors(target, 'cannot be written'), new_file(target, kind) as out:
             file = ChunkFile(out, splits.LIBRARY)
             for chunk in chain([first], chunks):
@@ -375,6 +377,8 @@ def _rebuilt(
     builder = ChunkBuilder()
     m = messages
     for k in kept.tolist():
-        head = (int(column[k]) for column in (m.channel, m.sequence, m.log_time, m.publish_time))
-        builder.add(*head, m.payload(content, k))
+        channel, sequence, log_ns, publish_ns = (
+            int(column[k]) for column in (m.channel, m.sequence, m.log_time, m.publish_time)
+        )
+        builder.add(channel, sequence, log_ns, publish_ns, m.payload(content, k))
     return builder.build(b''.join(RECORD_HEAD.pack(op, len(raw)) + raw for op, raw in others))

@@ -26,6 +26,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Chunk as ChunkRecord
 
 from valveflow_ros.errors import counted
+from valveflow_ros.logs import source as limits
 from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES
 from valveflow_ros.logs.mcap.records import (
     FIRST_FOREIGN,
@@ -43,7 +44,7 @@ from valveflow_ros.logs.mcap.records import (
     unpack,
     unpack_attachment,
 )
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Budget, Limits, OverBudgetError, Source
+from valveflow_ros.logs.source import Budget, OverBudgetError, Source
 
 # A chunk record: opcode 6, a length below 64 GiB, four fixed fields, then the
 # name of the compression. `_fields_agree` checks the length.
@@ -172,15 +173,14 @@ class Scanner:
         The records found so far outside of chunks, each once.
     """
 
-    def __init__(self, source: Source, limits: Limits = DEFAULT_LIMITS) -> None:
+    def __init__(self, source: Source) -> None:
         self.findings = Findings()
         self.outside: list[Schema | Channel] = []
-        self._outside_table = TopicTable(limits)
+        self._outside_table = TopicTable()
         self._in_summary = False
         self._source = source
-        self._limits = limits
-        self._budget = Budget(source.size, limits)
-        self._attachment_bytes_left = limits.attachment_bytes
+        self._budget = Budget(source.size)
+        self._attachment_bytes_left = limits.ATTACHMENT_BYTES
         self._unpacker = Unpacker()
         self._before = b''
 
@@ -245,7 +245,7 @@ class Scanner:
                 chunk = self._accept(position, length)
             except LayoutError as error:
                 if after <= self._source.size:
-                    self._budget.spend_in_vain(length)
+                    self._budget.spend(length, in_vain=True)
                     problem = f'the chunk at byte {position}: {error}'
                 # The length is trusted if it agrees with the fields of the chunk head.
                 if has_chunk_at(self._source, position) and self._plausible(after):
@@ -273,7 +273,7 @@ class Scanner:
             try:
                 return self._accept(position, length)
             except LayoutError:
-                self._budget.spend_in_vain(length)
+                self._budget.spend(length, in_vain=True)
         return None
 
     def _accept(self, position: int, length: int) -> Chunk:
@@ -283,7 +283,7 @@ class Scanner:
         return chunk
 
     def _chunk(self, position: int, length: int) -> Chunk:
-        if length > self._limits.record_bytes:
+        if length > limits.RECORD_BYTES:
             raise LayoutError(f'its length of {length} bytes is beyond all bounds')
         raw = self._source.read(position, RECORD_HEAD.size + length)
         if len(raw) < RECORD_HEAD.size + length:
@@ -299,7 +299,7 @@ class Scanner:
         hides = exact < length and (self._begins_record(inner_end) or not self._plausible(end))
         if exact > length or hides:
             raise LayoutError('its length disagrees with its content')
-        if size > self._limits.chunk_bytes:
+        if size > limits.CHUNK_CONTENT_BYTES:
             raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
         self._budget.spend(size)
         content = self._unpacker.unpack(name, found.data, size)
@@ -315,7 +315,7 @@ class Scanner:
 
     def _run(self, position: int, length: int) -> Chunk:
         """Return the messages that start at a position, up to about the size of a chunk."""
-        if length > self._limits.record_bytes:
+        if length > limits.RECORD_BYTES:
             raise LayoutError(f'its length of {length} bytes is beyond all bounds')
         raw = self._source.read(position, max(CHUNK_BYTES, RECORD_HEAD.size + length))
         number, size = leading_messages(raw)
@@ -344,7 +344,7 @@ class Scanner:
                 first = MESSAGE_HEAD.unpack_from(content, RECORD_HEAD.size)
                 if (channel, log_time) == (first[0], first[2]):
                     return True
-        if length > self._limits.definition_bytes:
+        if length > limits.DEFINITION_BYTES:
             return False
         content = self._source.read(position + RECORD_HEAD.size, length)
         try:
@@ -355,13 +355,13 @@ class Scanner:
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
         """Process a record other than a chunk; return a chunk that a wrong length would hide."""
         if op == Opcode.MESSAGE:
-            large = length > self._limits.record_bytes
+            large = length > limits.RECORD_BYTES
             why = 'is larger than can be read' if large else 'cannot be one'
             self.findings.add_damage(f'the message at byte {position} {why}')
         if op == Opcode.ATTACHMENT:
             self._attachment(position, length)
             return None
-        if op == Opcode.METADATA and length <= self._limits.definition_bytes:
+        if op == Opcode.METADATA and length <= limits.DEFINITION_BYTES:
             self._metadata(position, length)
         # The summary, which follows, repeats these records with a checksum.
         if op == Opcode.DATA_END and not self._in_summary:
@@ -405,14 +405,14 @@ class Scanner:
         except LayoutError as error:
             self.findings.add_damage(f'the metadata at byte {position}: {error}')
             return
-        if len(self.findings.metadata) < self._limits.channels:
+        if len(self.findings.metadata) < limits.MOST_TOPICS:
             self.findings.metadata.append((found.name, found.metadata))
 
     def _definition(self, op: int, position: int, length: int) -> None:
         """Add a schema or a channel from outside of chunks."""
         kind = 'schema' if op == Opcode.SCHEMA else 'channel'
         try:
-            if length > self._limits.definition_bytes:
+            if length > limits.DEFINITION_BYTES:
                 raise LayoutError('it is larger than can be read')
             record = definition(op, self._source.read(position + RECORD_HEAD.size, length))
             known = self._outside_table
