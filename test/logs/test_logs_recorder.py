@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import yaml
@@ -31,7 +32,6 @@ from log_files import (
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import LATCHED, Message, Recorder, RecorderState, RecordingWriter, open_log
-from valveflow_ros.logs.mcap import recorder as recorder_module
 from valveflow_ros.logs.part_file import PartFile, is_held
 
 
@@ -103,7 +103,7 @@ def test_whatever_call_fails_nothing_is_lost_and_every_whole_file_is_listed(fold
     assert values_in(folder) == list(range(30))
 
 
-def test_a_full_disk_keeps_all_waiting_until_space_returns_and_loses_what_it_says(folder):
+def test_a_full_disk_keeps_all_waiting_until_space_returns(folder):
     recorder = recorder_of(folder)
     put(recorder, 0, 40)
     faults = Faults('recorder', 1, errno.ENOSPC)
@@ -119,14 +119,19 @@ def test_a_full_disk_keeps_all_waiting_until_space_returns_and_loses_what_it_say
         faults.heal()
         wait_for(lambda: recorder.status().written == 90)
         wait_for(lambda: recorder.status().state == RecorderState.RECORDING)
-    with Faults('recorder', 1, errno.ENOSPC).active():
-        record(recorder, 90, 10)
-        status = recorder.close()
-    assert (status.state, status.lost, status.written) == (RecorderState.STOPPED, 10, 90)
-    assert balanced(status)
-    names = sorted(p.name for p in folder.glob('*.mcap*'))
-    assert names == ['log_0.mcap.part', 'log_1.mcap.part']
+    assert recorder.close().lost == 0
+    assert sorted(p.name for p in folder.glob('*.mcap*')) == ['log_0.mcap.part', 'log_1.mcap']
     assert values_in(folder) == list(range(90))
+
+
+def test_what_never_came_to_a_disk_is_lost_and_said(folder):
+    with Faults('recorder', 1, errno.ENOSPC).active():
+        recorder = recorder_of(folder)
+        record(recorder, 0, 50)
+        status = recorder.close()
+    assert (status.state, status.lost, status.written) == (RecorderState.STOPPED, 50, 0)
+    assert balanced(status)
+    assert list(folder.glob('*.mcap*')) == []
 
 
 def gated(gate):
@@ -251,18 +256,21 @@ def test_the_oldest_files_go_when_told_so(folder):
 
 
 def test_an_old_file_that_cannot_be_removed_is_said_and_recording_goes_on(folder, monkeypatch):
-    monkeypatch.setattr(recorder_module, '_LOOK_S', 600.0)
     # A retry so late that what is said can be seen.
     recorder = recorder_of(folder, replace(QUICK, keep_files=1, retry_s=0.5, retry_max_s=0.5))
-    put(recorder, 0)
-    rotate(recorder)
-    old = folder / 'log_0.mcap'
-    old.unlink()
-    old.mkdir()
-    record(recorder, 1)
-    rotate(recorder)
-    wait_for(lambda: 'cannot be removed (Is a directory)' in recorder.status().reason)
-    old.rmdir()
+    unlink, stuck = Path.unlink, [True]
+
+    def sticky(path, missing_ok=False):
+        if stuck and path.name == 'log_0.mcap':
+            raise PermissionError(errno.EPERM, 'Operation not permitted')
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, 'unlink', sticky)
+    for k in range(2):
+        record(recorder, k)
+        rotate(recorder)
+    wait_for(lambda: 'cannot be removed (Operation not permitted)' in recorder.status().reason)
+    stuck.clear()
     record(recorder, 2)
     rotate(recorder)
     recorder.close()

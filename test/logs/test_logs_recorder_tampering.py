@@ -10,9 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 from log_files import (
@@ -26,16 +24,17 @@ from log_files import (
     put,
     record,
     recorder_of,
+    records,
     rotate,
     wait_for,
 )
+from mcap.opcode import Opcode
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import RecordingWriter, recover, recover_leftovers
 from valveflow_ros.logs.mcap import recorder as recorder_module
 
 BEFORE, AFTER = 200, 100
-Act = Callable[[Path], None]
 
 
 def unlink(path):
@@ -72,8 +71,9 @@ def append(path):
 
 
 def overwrite(path):
+    chunks = [begin for op, begin, _ in records(path.read_bytes()) if op == Opcode.CHUNK]
     with path.open('r+b') as file:
-        file.seek(path.stat().st_size // 8)
+        file.seek(chunks[3] + 100)
         file.write(bytes(50))
 
 
