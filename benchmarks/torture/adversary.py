@@ -224,6 +224,9 @@ class World:
         self.start()
 
 
+Act = Callable[[World], object]
+
+
 def truth(folder: Path) -> dict[Path, set[Key]]:
     """Return what a reader finds in each recording: topic and number of each message."""
     found: dict[Path, set[Key]] = {}
@@ -245,67 +248,45 @@ def _keys(path: Path) -> set[Key]:
 # The acts. Each takes a world and does one thing to it.
 
 
-def delete_file(world: World) -> None:
-    for path in world.any_file():
-        path.unlink()
+def _truncate(path: Path, generator: random.Random) -> None:
+    os.truncate(path, generator.randrange(path.stat().st_size + 1))
 
 
-def move_file(world: World) -> None:
-    for path in world.any_file():
-        path.rename(world.aside())
+def _extend(path: Path, generator: random.Random) -> None:
+    with path.open('ab') as stream:
+        stream.write(generator.randbytes(100))
 
 
-def link_file(world: World) -> None:
-    for path in world.any_file():
-        path.symlink_to(path.rename(world.aside()))
+def _overwrite(path: Path, generator: random.Random) -> None:
+    with path.open('r+b') as stream:
+        stream.seek(generator.randrange(path.stat().st_size + 1))
+        stream.write(generator.randbytes(50))
 
 
-def truncate_file(world: World) -> None:
-    for path in world.any_file():
-        os.truncate(path, world.generator.randrange(path.stat().st_size + 1))
+def _to_a_file(change: Callable[[Path, random.Random], object]) -> Act:
+    return lambda world: [change(path, world.generator) for path in world.any_file()]
 
 
-def extend_file(world: World) -> None:
-    for path in world.any_file():
-        with path.open('ab') as stream:
-            stream.write(world.generator.randbytes(100))
+def _move(find: Callable[[World], list[Path]], *, link: bool = False) -> Act:
+    def act(world: World) -> None:
+        for path in find(world):
+            moved = path.rename(world.aside())
+            if link:
+                path.symlink_to(moved)
+
+    return act
 
 
-def overwrite_file(world: World) -> None:
-    for path in world.any_file():
-        with path.open('r+b') as stream:
-            stream.seek(world.generator.randrange(path.stat().st_size + 1))
-            stream.write(world.generator.randbytes(50))
+def _remove(find: Callable[[World], list[Path]]) -> Act:
+    return lambda world: [shutil.rmtree(path, ignore_errors=True) for path in find(world)]
 
 
-def delete_recording(world: World) -> None:
-    for folder in world.recording():
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def move_recording(world: World) -> None:
-    for folder in world.recording():
-        folder.rename(world.aside())
-
-
-def delete_all_recordings(world: World) -> None:
-    shutil.rmtree(world.recordings, ignore_errors=True)
-
-
-def delete_state(world: World) -> None:
-    shutil.rmtree(world.state.parent, ignore_errors=True)
-
-
-def delete_state_file(world: World) -> None:
-    world.state.unlink(missing_ok=True)
-
-
-def truncate_state_file(world: World) -> None:
+def _truncate_state_file(world: World) -> None:
     with suppress(FileNotFoundError):
         os.truncate(world.state, 20)
 
 
-def delete_lock_and_start_another(world: World) -> None:
+def _delete_lock_and_start_another(world: World) -> None:
     world.state.with_name('lock').unlink(missing_ok=True)
     before = truth(world.folder)
     second = world.new_session()
@@ -322,7 +303,7 @@ def delete_lock_and_start_another(world: World) -> None:
         world.problems.append(f'the second one: {claimed} claimed, {found} found in {folder}')
 
 
-def fill_disk(world: World) -> None:
+def _fill_disk(world: World) -> None:
     pid = world.session.process.pid
     _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
@@ -330,45 +311,41 @@ def fill_disk(world: World) -> None:
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
 
 
-def stop_process(world: World) -> None:
+def _stop_process(world: World) -> None:
     world.session.process.send_signal(signal.SIGSTOP)
     time.sleep(world.generator.uniform(0.2, 2.0))
     world.session.process.send_signal(signal.SIGCONT)
 
 
-def kill_process(world: World) -> None:
-    world.kill_and_start()
-
-
-def kill_process_and_wait_400_days(world: World) -> None:
-    world.kill_and_start(400.0 * DAY_S)
-
-
-def step_clock_back(world: World) -> None:
-    world.step_clock(-world.generator.uniform(0.1, 2.0) * DAY_S)
-
-
-def step_clock_on(world: World) -> None:
-    world.step_clock(world.generator.uniform(0.001, 2.0) * DAY_S)
-
-
-def restart_gateway(world: World) -> None:
+def _restart_gateway(world: World) -> None:
     for _ in range(world.generator.randint(1, 4)):
         world.gateway.start_again()
         time.sleep(0.3)
 
 
-def storm_of_requests(world: World) -> None:
-    world.storms.append(world.gateway.storm())
-
-
-ALL_ACTS = (
-    delete_file, move_file, link_file, truncate_file, extend_file, overwrite_file,
-    delete_recording, move_recording, delete_all_recordings, delete_state, delete_state_file,
-    truncate_state_file, delete_lock_and_start_another, fill_disk, stop_process, kill_process,
-    kill_process_and_wait_400_days, step_clock_back, step_clock_on, restart_gateway,
-    storm_of_requests,
-)  # fmt: skip
+ALL_ACTS: dict[str, Act] = {
+    'delete_file': _to_a_file(lambda path, _: path.unlink()),
+    'move_file': _move(World.any_file),
+    'link_file': _move(World.any_file, link=True),
+    'truncate_file': _to_a_file(_truncate),
+    'extend_file': _to_a_file(_extend),
+    'overwrite_file': _to_a_file(_overwrite),
+    'delete_recording': _remove(World.recording),
+    'move_recording': _move(World.recording),
+    'delete_all_recordings': _remove(lambda world: [world.recordings]),
+    'delete_state': _remove(lambda world: [world.state.parent]),
+    'delete_state_file': lambda world: world.state.unlink(missing_ok=True),
+    'truncate_state_file': _truncate_state_file,
+    'delete_lock_and_start_another': _delete_lock_and_start_another,
+    'fill_disk': _fill_disk,
+    'stop_process': _stop_process,
+    'kill_process': World.kill_and_start,
+    'kill_process_and_wait_400_days': lambda world: world.kill_and_start(400.0 * DAY_S),
+    'step_clock_back': lambda w: w.step_clock(-w.generator.uniform(0.1, 2.0) * DAY_S),
+    'step_clock_on': lambda w: w.step_clock(w.generator.uniform(0.001, 2.0) * DAY_S),
+    'restart_gateway': _restart_gateway,
+    'storm_of_requests': lambda world: world.storms.append(world.gateway.storm()),
+}
 
 
 def adversary(options: Options) -> Outcome:
@@ -397,14 +374,13 @@ def _run(
 ) -> None:  # fmt: skip
     """Compose one run and judge it; add to the table of acts."""
     generator = random.Random(f'{options.seed} {run}')
-    acts = generator.choices(ALL_ACTS, k=generator.randint(*ACTS))
+    names = generator.choices(list(ALL_ACTS), k=generator.randint(*ACTS))
     world = World(options.folder / str(run), gateway, generator)
-    for act in acts:
+    for name in names:
         time.sleep(generator.uniform(*PAUSE_S))
-        act(world)
+        ALL_ACTS[name](world)
     time.sleep(generator.uniform(*PAUSE_S))
-    names = [act.__name__ for act in acts]
-    outcome.count('composed', len(acts))
+    outcome.count('composed', len(names))
     before = outcome.failed
     claimed, found = _judge(world, f'run {run} ({", ".join(names)})', outcome)
     false = int(outcome.failed > before)
