@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.torture.trial import RESULTS, Options, Outcome, Trial, write_result
+from benchmarks.torture.trial import RESULTS, Options, Outcome
 
 SEED = 20_240_601
 # Where each trial stands, and after how many seconds it is given up.
@@ -27,56 +27,42 @@ TRIALS = {
     'flips': ('damage_trials', 1800),
     'first_chunk': ('damage_trials', 600),
     'hostile': ('hostile', 600),
-    'foreign': ('foreign', 600),
     'kill9': ('kills', 2400),
-    'recover_big': ('recover_big', 1800),
-    'fail_every_write': ('faults', 2400),
-    'disk_full': ('disk_full', 600),
-    'power_loss': ('power_loss', 1200),
-    'rotation': ('rotation', 600),
+    'recover_big': ('kills', 1800),
+    'rotation': ('kills', 600),
+    'fail_every_write': ('disks', 2400),
+    'disk_full': ('disks', 600),
+    'power_loss': ('disks', 1200),
     'fuzz': ('fuzz', 7200),
-    'signals': ('signals', 3600),
+    'signals': ('monitors', 3600),
     'restart': ('restart', 5400),
-    'rehearing': ('rehearing', 3600),
+    'rehearing': ('monitors', 3600),
     'adversary': ('adversary', 7200),
     'soak': ('soak', 7200),
 }
 
 
-def trial_of(name: str) -> Trial:
-    """Return the function of a trial."""
-    module = importlib.import_module(f'benchmarks.torture.{TRIALS[name][0]}')
-    found: Trial = getattr(module, name)
-    return found
-
-
 def run_here(name: str, given: argparse.Namespace) -> int:
-    """Run one trial in this process and write what it brought."""
+    """Run one trial in this process, write what it brought, and print it."""
     begun_s = time.monotonic()
+    trial = getattr(importlib.import_module(f'benchmarks.torture.{TRIALS[name][0]}'), name)
     with tempfile.TemporaryDirectory(prefix=f'torture_{name}_') as folder:
         options = Options(given.scale, given.seed, Path(folder), given.minutes)
-        outcome = trial_of(name)(options)
+        outcome: Outcome = trial(options)
     seconds = time.monotonic() - begun_s
-    write_result(name, outcome, options, seconds, given.results)
-    say(name, outcome, seconds)
-    return 1 if outcome.failed else 0
-
-
-def say(name: str, outcome: Outcome, seconds: float) -> None:
-    """Print one line, and one for each failure that is shown."""
+    outcome.write(name, options, seconds, given.results)
     verdict = 'FAILED' if outcome.failed else 'passed'
     print(f'{name:17} {verdict}  {outcome.sentence}  ({seconds:.0f} s)')
-    for failure in outcome.failures:
-        print(f'    {failure}')
-    for missed in outcome.missed:
-        print(f'    missed: {missed}')
+    for line in [*outcome.failures, *(f'missed: {missed}' for missed in outcome.missed)]:
+        print(f'    {line}')
+    return 1 if outcome.failed else 0
 
 
 def run_apart(name: str, given: argparse.Namespace) -> int:
     """Run one trial in a process of its own; whatever ends that process is a failure."""
     command = [sys.executable, '-m', 'benchmarks.torture', '--inside', '--only', name]
-    command += ['--scale', str(given.scale), '--seed', str(given.seed)]
-    command += ['--minutes', str(given.minutes), '--results', str(given.results)]
+    for option in ('scale', 'seed', 'minutes', 'results'):
+        command += [f'--{option}', str(getattr(given, option))]
     limit_s = TRIALS[name][1] + 60 * given.minutes
     try:
         status = subprocess.run(command, timeout=limit_s, check=False).returncode
@@ -88,7 +74,7 @@ def run_apart(name: str, given: argparse.Namespace) -> int:
     return 1 if status else 0
 
 
-def arguments() -> argparse.Namespace:
+def main() -> int:
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks.torture',
         description=__doc__,
@@ -103,11 +89,6 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     if not 0 < given.scale <= 1:
         parser.error('--scale is more than 0 and at most 1')
-    return given
-
-
-def main() -> int:
-    given = arguments()
     if given.inside:
         return run_here(given.only[0], given)
     return max(run_apart(name, given) for name in given.only)

@@ -24,22 +24,19 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from log_files import numbered
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64
+from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from benchmarks.torture.monitors import MANY, Inputs, killed, ros_node
 from benchmarks.torture.stepped_clock import SECONDS
-from benchmarks.torture.stock import stock_messages
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.logs import recover
-from valveflow_ros.records import SIGNALS
 from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.node.outputs import OUTPUTS, SERVICES
 from valveflow_ros.state import from_bytes
@@ -58,9 +55,6 @@ BURST = 17
 DAY_S = 86_400.0
 # Latched outputs, each of which keeps some.
 REPEATED = sum(topic.latched for topic in OUTPUTS.values())
-MANY = QoSProfile(depth=1000)
-VALUES = {'valve_opening': 50.0, 'main_steam_pressure': 12.0, 'main_steam_temperature': 530.0,
-          'generated_power': 300.0}  # fmt: skip
 Key = tuple[str, int]
 
 
@@ -95,30 +89,21 @@ class Session:
 class Gateway:
     """Publishes four signals without a pause, hears the health and calls the services."""
 
-    def __init__(self) -> None:
-        self.node = rclpy.create_node('adversary')
-        self._inputs = self._publishers()
+    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
         self.health: dict[str, str] = {}
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._heard, MANY)
+        self._inputs, self._executor = Inputs(node), executor
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._heard, MANY)
         name = '/valveflow_monitor'
         self._triggers = [
-            self.node.create_client(Trigger, f'{name}/{service}', qos_profile=MANY)
+            node.create_client(Trigger, f'{name}/{service}', qos_profile=MANY)
             for service in SERVICES
         ]
-        self._setter = self.node.create_client(
+        self._setter = node.create_client(
             SetParameters, f'{name}/set_parameters', qos_profile=MANY
         )
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
         self._going, self._renew = True, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
-
-    def _publishers(self) -> list[tuple[Publisher, float]]:
-        return [
-            (self.node.create_publisher(Float64, info.topic, MANY), VALUES[info.topic])
-            for info in SIGNALS if info.required
-        ]  # fmt: skip
 
     def start_again(self) -> None:
         """Publish with new publishers, as a gateway that was started again."""
@@ -132,16 +117,11 @@ class Gateway:
                 self.health = {value.key: value.value for value in status.values}
 
     def _run(self) -> None:
-        number = 0
         while self._going:
             if self._renew.is_set():
-                for publisher, _ in self._inputs:
-                    self.node.destroy_publisher(publisher)
-                self._inputs = self._publishers()
+                self._inputs.renew()
                 self._renew.clear()
-            for publisher, value in self._inputs:
-                publisher.publish(Float64(data=value + 0.01 * (number % 100)))
-            number += 1
+            self._inputs.publish()
             end_s = time.monotonic() + PERIOD_S
             while (left_s := end_s - time.monotonic()) > 0:
                 self._executor.spin_once(timeout_sec=left_s)
@@ -165,7 +145,6 @@ class Gateway:
         """Publish no more."""
         self._going = False
         self._thread.join()
-        self.node.destroy_node()
 
 
 class World:
@@ -175,6 +154,7 @@ class World:
         self.folder, self.gateway, self.generator = folder, gateway, generator
         self.recordings = folder / 'recordings'
         self._clock = folder / 'clock'
+        self.state = self.recordings / 'state_unit' / 'monitor.state'
         folder.mkdir()
         self._clock.write_bytes(SECONDS.pack(0.0))
         self.sessions: list[Session] = []
@@ -215,19 +195,20 @@ class World:
             time.sleep(0.02)
         return bool(done())
 
-    def files(self, pattern: str) -> list[Path]:
-        """Return files of all recordings."""
-        return sorted(self.recordings.glob(f'valveflow_*/{pattern}'))
+    def any_file(self) -> list[Path]:
+        """Return a finished or growing file of any recording, if there is one."""
+        found = [
+            p for end in ('', '.part') for p in sorted(self.recordings.glob(f'*/*.mcap{end}'))
+        ]
+        return [self.generator.choice(found)] if found else []
 
-    def any_file(self) -> Path | None:
-        """Return a finished or growing file."""
-        found = self.files('*.mcap') + self.files('*.mcap.part')
-        return self.generator.choice(found) if found else None
+    def recording(self) -> list[Path]:
+        """Return the newest recording, if there is one."""
+        return sorted(self.recordings.glob('valveflow_*'))[-1:]
 
-    def recording(self) -> Path | None:
-        """Return the newest recording."""
-        found = sorted(self.recordings.glob('valveflow_*'))
-        return found[-1] if found else None
+    def aside(self) -> Path:
+        """Return a new place outside of the recordings."""
+        return self.folder / f'moved_{time.monotonic_ns()}'
 
     def step_clock(self, seconds: float) -> None:
         """Step the clock of all monitors."""
@@ -237,11 +218,13 @@ class World:
 
     def kill_and_start(self, later_s: float = 0.0) -> None:
         """Kill the monitor and start another, with a clock that went on meanwhile."""
-        self.session.process.kill()
-        self.session.process.wait()
+        killed(self.session.process)
         self.before = truth(self.folder)
         self.step_clock(later_s)
         self.start()
+
+
+Act = Callable[[World], object]
 
 
 def truth(folder: Path) -> dict[Path, set[Key]]:
@@ -249,84 +232,62 @@ def truth(folder: Path) -> dict[Path, set[Key]]:
     found: dict[Path, set[Key]] = {}
     for path in sorted(folder.glob('recordings/valveflow_*/*.mcap*')):
         keys = found.setdefault(path.parent, set())
-        with tempfile.TemporaryDirectory() as scratch:
-            try:
-                keys |= {(topic, number) for topic, number, _, _ in stock_messages(path)}
-            except Exception:  # noqa: BLE001 - readers raise what they like
-                whole = Path(scratch, 'whole.mcap')
-                with suppress(ValveflowError):
-                    recover(path, whole)
-                    keys |= {(topic, number) for topic, number, _, _ in stock_messages(whole)}
+        try:
+            keys |= _keys(path)
+        except Exception:  # noqa: BLE001 - readers raise what they like
+            with tempfile.TemporaryDirectory() as scratch, suppress(ValveflowError):
+                recover(path, Path(scratch, 'whole.mcap'))
+                keys |= _keys(Path(scratch, 'whole.mcap'))
     return found
+
+
+def _keys(path: Path) -> set[Key]:
+    return {(message.topic, number) for message, number in numbered(path)}
 
 
 # The acts. Each takes a world and does one thing to it.
 
 
-def delete_file(world: World) -> None:
-    if path := world.any_file():
-        path.unlink()
+def _truncate(path: Path, generator: random.Random) -> None:
+    os.truncate(path, generator.randrange(path.stat().st_size + 1))
 
 
-def move_file(world: World) -> None:
-    if path := world.any_file():
-        path.rename(world.folder / f'moved_{time.monotonic_ns()}')
+def _extend(path: Path, generator: random.Random) -> None:
+    with path.open('ab') as stream:
+        stream.write(generator.randbytes(100))
 
 
-def link_file(world: World) -> None:
-    if path := world.any_file():
-        other = world.folder / f'linked_{time.monotonic_ns()}'
-        path.rename(other)
-        path.symlink_to(other)
+def _overwrite(path: Path, generator: random.Random) -> None:
+    with path.open('r+b') as stream:
+        stream.seek(generator.randrange(path.stat().st_size + 1))
+        stream.write(generator.randbytes(50))
 
 
-def truncate_file(world: World) -> None:
-    if path := world.any_file():
-        os.truncate(path, world.generator.randrange(path.stat().st_size + 1))
+def _to_a_file(change: Callable[[Path, random.Random], object]) -> Act:
+    return lambda world: [change(path, world.generator) for path in world.any_file()]
 
 
-def extend_file(world: World) -> None:
-    if path := world.any_file():
-        with path.open('ab') as stream:
-            stream.write(world.generator.randbytes(100))
+def _move(find: Callable[[World], list[Path]], *, link: bool = False) -> Act:
+    def act(world: World) -> None:
+        for path in find(world):
+            moved = path.rename(world.aside())
+            if link:
+                path.symlink_to(moved)
+
+    return act
 
 
-def overwrite_file(world: World) -> None:
-    if path := world.any_file():
-        with path.open('r+b') as stream:
-            stream.seek(world.generator.randrange(path.stat().st_size + 1))
-            stream.write(world.generator.randbytes(50))
+def _remove(find: Callable[[World], list[Path]]) -> Act:
+    return lambda world: [shutil.rmtree(path, ignore_errors=True) for path in find(world)]
 
 
-def delete_recording(world: World) -> None:
-    if folder := world.recording():
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def move_recording(world: World) -> None:
-    if folder := world.recording():
-        folder.rename(world.folder / f'moved_{time.monotonic_ns()}')
-
-
-def delete_all_recordings(world: World) -> None:
-    shutil.rmtree(world.recordings, ignore_errors=True)
-
-
-def delete_state(world: World) -> None:
-    shutil.rmtree(world.recordings / 'state_unit', ignore_errors=True)
-
-
-def delete_state_file(world: World) -> None:
-    (world.recordings / 'state_unit' / 'monitor.state').unlink(missing_ok=True)
-
-
-def truncate_state_file(world: World) -> None:
+def _truncate_state_file(world: World) -> None:
     with suppress(FileNotFoundError):
-        os.truncate(world.recordings / 'state_unit' / 'monitor.state', 20)
+        os.truncate(world.state, 20)
 
 
-def delete_lock_and_start_another(world: World) -> None:
-    (world.recordings / 'state_unit' / 'lock').unlink(missing_ok=True)
+def _delete_lock_and_start_another(world: World) -> None:
+    world.state.with_name('lock').unlink(missing_ok=True)
     before = truth(world.folder)
     second = world.new_session()
     time.sleep(world.generator.uniform(2.0, 5.0))
@@ -342,7 +303,7 @@ def delete_lock_and_start_another(world: World) -> None:
         world.problems.append(f'the second one: {claimed} claimed, {found} found in {folder}')
 
 
-def fill_disk(world: World) -> None:
+def _fill_disk(world: World) -> None:
     pid = world.session.process.pid
     _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
@@ -350,78 +311,52 @@ def fill_disk(world: World) -> None:
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
 
 
-def stop_process(world: World) -> None:
+def _stop_process(world: World) -> None:
     world.session.process.send_signal(signal.SIGSTOP)
     time.sleep(world.generator.uniform(0.2, 2.0))
     world.session.process.send_signal(signal.SIGCONT)
 
 
-def kill_process(world: World) -> None:
-    world.kill_and_start()
-
-
-def kill_process_and_wait_400_days(world: World) -> None:
-    world.kill_and_start(400.0 * DAY_S)
-
-
-def step_clock_back(world: World) -> None:
-    world.step_clock(-world.generator.uniform(0.1, 2.0) * DAY_S)
-
-
-def step_clock_on(world: World) -> None:
-    world.step_clock(world.generator.uniform(0.001, 2.0) * DAY_S)
-
-
-def restart_gateway(world: World) -> None:
+def _restart_gateway(world: World) -> None:
     for _ in range(world.generator.randint(1, 4)):
         world.gateway.start_again()
         time.sleep(0.3)
 
 
-def storm_of_requests(world: World) -> None:
-    world.storms.append(world.gateway.storm())
-
-
-ALL_ACTS = (
-    delete_file, move_file, link_file, truncate_file, extend_file, overwrite_file,
-    delete_recording, move_recording, delete_all_recordings, delete_state, delete_state_file,
-    truncate_state_file, delete_lock_and_start_another, fill_disk, stop_process, kill_process,
-    kill_process_and_wait_400_days, step_clock_back, step_clock_on, restart_gateway,
-    storm_of_requests,
-)  # fmt: skip
+ALL_ACTS: dict[str, Act] = {
+    'delete_file': _to_a_file(lambda path, _: path.unlink()),
+    'move_file': _move(World.any_file),
+    'link_file': _move(World.any_file, link=True),
+    'truncate_file': _to_a_file(_truncate),
+    'extend_file': _to_a_file(_extend),
+    'overwrite_file': _to_a_file(_overwrite),
+    'delete_recording': _remove(World.recording),
+    'move_recording': _move(World.recording),
+    'delete_all_recordings': _remove(lambda world: [world.recordings]),
+    'delete_state': _remove(lambda world: [world.state.parent]),
+    'delete_state_file': lambda world: world.state.unlink(missing_ok=True),
+    'truncate_state_file': _truncate_state_file,
+    'delete_lock_and_start_another': _delete_lock_and_start_another,
+    'fill_disk': _fill_disk,
+    'stop_process': _stop_process,
+    'kill_process': World.kill_and_start,
+    'kill_process_and_wait_400_days': lambda world: world.kill_and_start(400.0 * DAY_S),
+    'step_clock_back': lambda w: w.step_clock(-w.generator.uniform(0.1, 2.0) * DAY_S),
+    'step_clock_on': lambda w: w.step_clock(w.generator.uniform(0.001, 2.0) * DAY_S),
+    'restart_gateway': _restart_gateway,
+    'storm_of_requests': lambda world: world.storms.append(world.gateway.storm()),
+}
 
 
 def adversary(options: Options) -> Outcome:
     """Compose acts from a seed, end the monitor, and compare its claims with what is there."""
     outcome = Outcome()
-    os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    rclpy.init(args=[])
-    gateway = Gateway()
     table: dict[str, dict[str, int]] = {}
-    for run in range(options.many(RUNS, 2)):
-        generator = random.Random(f'{options.seed} {run}')
-        acts = generator.choices(ALL_ACTS, k=generator.randint(*ACTS))
-        world = World(options.folder / str(run), gateway, generator)
-        for act in acts:
-            time.sleep(generator.uniform(*PAUSE_S))
-            act(world)
-        time.sleep(generator.uniform(*PAUSE_S))
-        names = [act.__name__ for act in acts]
-        outcome.count('composed', len(acts))
-        before = outcome.failed
-        claimed, found = _judge(world, f'run {run} ({", ".join(names)})', outcome)
-        for name in set(names):
-            row = table.setdefault(name, dict.fromkeys(('runs', 'claimed', 'found', 'false'), 0))
-            for key, value in (
-                ('runs', 1), ('claimed', claimed), ('found', found),
-                ('false', outcome.failed > before),
-            ):  # fmt: skip
-                row[key] += value
-        if outcome.failed == before:
-            shutil.rmtree(options.folder / str(run))
-    gateway.close()
-    rclpy.shutdown()
+    with ros_node('adversary') as (node, executor):
+        gateway = Gateway(node, executor)
+        for run in range(options.many(RUNS, 2)):
+            _run(run, options, gateway, table, outcome)
+        gateway.close()
     outcome.counts['acts'] = dict(sorted(table.items()))
     counts = outcome.counts
     outcome.sentence = (
@@ -431,6 +366,30 @@ def adversary(options: Options) -> Outcome:
         f'last of a burst after {outcome.measured.get("longest_answer_s", 0.0):.2f} s at most'
     )
     return outcome
+
+
+def _run(
+    run: int, options: Options, gateway: Gateway, table: dict[str, dict[str, int]],
+    outcome: Outcome,
+) -> None:  # fmt: skip
+    """Compose one run and judge it; add to the table of acts."""
+    generator = random.Random(f'{options.seed} {run}')
+    names = generator.choices(list(ALL_ACTS), k=generator.randint(*ACTS))
+    world = World(options.folder / str(run), gateway, generator)
+    for name in names:
+        time.sleep(generator.uniform(*PAUSE_S))
+        ALL_ACTS[name](world)
+    time.sleep(generator.uniform(*PAUSE_S))
+    outcome.count('composed', len(names))
+    before = outcome.failed
+    claimed, found = _judge(world, f'run {run} ({", ".join(names)})', outcome)
+    false = int(outcome.failed > before)
+    for name in set(names):
+        row = table.setdefault(name, dict.fromkeys(('runs', 'claimed', 'found', 'false'), 0))
+        for key, value in zip(row, (1, claimed, found, false), strict=True):
+            row[key] += value
+    if not false:
+        shutil.rmtree(world.folder)
 
 
 def _judge(world: World, what: str, outcome: Outcome) -> tuple[int, int]:
@@ -460,9 +419,8 @@ def _judge(world: World, what: str, outcome: Outcome) -> tuple[int, int]:
     )
     outcome.expect(told <= found, f'{what}: {told} written by the health, {found} found')
     if not session.says('he state cannot be saved'):
-        path = world.recordings / 'state_unit' / 'monitor.state'
         try:
-            from_bytes(path.read_bytes())
+            from_bytes(world.state.read_bytes())
         except (OSError, ValueError, ValveflowError) as error:
             outcome.expect(False, f'{what}: no word that there is no state ({error})')
     for asked, answered, seconds in world.storms:
@@ -482,8 +440,7 @@ def end(session: Session) -> list[str]:
         process.wait(END_S)
     except subprocess.TimeoutExpired:
         wrong.append(f'it did not end within {END_S:g} s')
-        process.kill()
-        process.wait()
+        killed(process)
     session.listener.join()
     if session.says('Traceback'):
         wrong.append(f'a traceback: {session.lines[-5:]}')

@@ -4,28 +4,25 @@
 
 from __future__ import annotations
 
-import os
 import random
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from valveflow_msgs.msg import Alarm, FlowCharacteristic
 
+from benchmarks.torture.monitors import Process, killed, ros_node, started
 from benchmarks.torture.trial import Options, Outcome
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import SampleTable
 from valveflow_ros.ros.decoding import PLANT_SAMPLE
-from valveflow_ros.ros.demo import ros_arguments
 from valveflow_ros.ros.player import Player
 from valveflow_ros.ros.simulator_main import stamped_steps
 from valveflow_ros.ros.verify import verify
@@ -42,22 +39,20 @@ SOON_S = 3.0
 PATIENCE_S = 240.0
 MONITOR = '/valveflow_monitor'
 LATCHED = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+start = partial(started, input_reliability='reliable', refit_period=3600.0, refit_segments=0)
 
 
 class Plant:
     """Sends rows and hears what the monitor says to them."""
 
-    def __init__(self, log: SampleTable) -> None:
-        self.node = Node('torture_plant')
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
-        self._log, self._done = log, 0
+    def __init__(self, node: Node, executor: SingleThreadedExecutor, log: SampleTable) -> None:
+        self._executor, self._log, self._done = executor, log, 0
         self.alarms: list[Alarm] = []
         self.curves: list[FlowCharacteristic] = []
-        subscribe = self.node.create_subscription
+        subscribe = node.create_subscription
         subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
         subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
-        self._player = Player(self.node, [PLANT_SAMPLE], 0.0, False, lambda: False)
+        self._player = Player(node, [PLANT_SAMPLE], 0.0, False, lambda: False)
 
     def play(self, rows: int) -> None:
         """Send the next rows, no faster than they are taken."""
@@ -75,30 +70,29 @@ class Plant:
                 return True
         return bool(done())
 
+    def has_curve(self) -> bool:
+        """Tell whether a curve was heard."""
+        return bool(self.curves and self.curves[-1].model_id)
+
 
 def restart(options: Options) -> Outcome:
     """Kill -9 at random moments of a run with refits and an alarm; then verify the recording."""
-    outcome = Outcome()
-    generator = random.Random(options.seed)
-    os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    rclpy.init(args=[])
+    outcome, generator = Outcome(), random.Random(options.seed)
     log = simulate(0.6, options.seed % 1000, effects=[EffectSpec.parse(FAULT)]).table
-    plant = Plant(log)
-    monitor = _started(options.folder)
-    plant.play(HISTORY)
-    plant.listen(PATIENCE_S, lambda: plant.curves and plant.curves[-1].model_id)
-    for number in range(options.many(KILLS, 3)):
-        plant.play(generator.randint(20, MOST_ROWS))
-        plant.listen(generator.uniform(0.0, LATEST_S))
-        monitor = _killed_and_started(plant, monitor, options.folder, f'kill {number}', outcome)
-    plant.play(100)
-    plant.listen(2.0)
-    monitor.terminate()
-    outcome.expect(monitor.wait(10.0) == 0, 'the last run did not end with status 0')
-    _judge(plant, options.folder, outcome)
-    plant.node.destroy_node()
-    rclpy.shutdown()
+    with ros_node('torture_plant') as (node, executor):
+        plant, monitor = Plant(node, executor, log), start(options.folder)
+        plant.play(HISTORY)
+        plant.listen(PATIENCE_S, plant.has_curve)
+        for number in range(options.many(KILLS, 3)):
+            plant.play(generator.randint(20, MOST_ROWS))
+            plant.listen(generator.uniform(0.0, LATEST_S))
+            what = f'kill {number}'
+            monitor = _killed_and_started(plant, monitor, options.folder, what, outcome)
+        plant.play(100)
+        plant.listen(2.0)
+        monitor.terminate()
+        outcome.expect(monitor.wait(10.0) == 0, 'the last run did not end with status 0')
+        _judge(plant, options.folder, outcome)
     counts = outcome.counts
     soon = counts.get('within_3_s', 0)
     outcome.wish(soon == counts['kills'], f'{soon} of {counts["kills"]} curves within 3 s')
@@ -110,23 +104,10 @@ def restart(options: Options) -> Outcome:
     return outcome
 
 
-def _started(folder: Path) -> subprocess.Popen[bytes]:
-    parameters = {
-        'record_directory': folder / 'recordings', 'input_reliability': 'reliable',
-        'refit_period': 3600.0, 'refit_segments': 0,
-    }  # fmt: skip
-    with (folder / 'monitor.log').open('ab') as log:
-        return subprocess.Popen(
-            [sys.executable, '-m', 'valveflow_ros.ros.monitor_main', *ros_arguments(parameters)],
-            stdout=log, stderr=subprocess.STDOUT,
-        )  # fmt: skip
-
-
 def _killed_and_started(
-    plant: Plant, monitor: subprocess.Popen[bytes], folder: Path, what: str, outcome: Outcome
-) -> subprocess.Popen[bytes]:
-    monitor.kill()
-    monitor.wait()
+    plant: Plant, monitor: Process, folder: Path, what: str, outcome: Outcome
+) -> Process:
+    killed(monitor)
     outcome.count('kills')
     # What was on its way when it died is heard first.
     plant.listen(0.5)
@@ -136,8 +117,8 @@ def _killed_and_started(
     newest = {a.name: a for a in plant.alarms}
     plant.curves.clear()
     begun_s = time.monotonic()
-    monitor = _started(folder)
-    found = plant.listen(PATIENCE_S, lambda: plant.curves and plant.curves[-1].model_id)
+    monitor = start(folder)
+    found = plant.listen(PATIENCE_S, plant.has_curve)
     took_s = time.monotonic() - begun_s
     outcome.worst('longest_s', round(took_s, 2))
     outcome.count('within_3_s', int(took_s <= SOON_S))

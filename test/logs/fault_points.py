@@ -31,14 +31,16 @@ class Faults:
         Number of the first call that fails, from 1.
     error : int
         The `errno` it fails with, or `SHORT`: that write takes a half and says so.
+    once : bool
+        The calls after it succeed.
     """
 
-    def __init__(self, thread: str, first: int, error: int) -> None:
+    def __init__(self, thread: str, first: int, error: int, once: bool = False) -> None:
         self.calls = 0
         self.failed_at_s: float | None = None
         self.what = ''
         self._thread, self._first, self._error = thread, first, error
-        self._healed = False
+        self._once, self._healed = once, False
 
     def heal(self) -> None:
         """Let everything succeed from now on."""
@@ -73,11 +75,11 @@ class Faults:
         if self.failed_at_s is None:
             self.failed_at_s = time.monotonic()
             self.what = name
+        self._healed |= self._once or self._error == SHORT
         half = b''
         if name == 'write':
             half = bytes(arguments[1])[: len(arguments[1]) // 2]
         if self._error == SHORT:
-            self._healed = True
             return call(arguments[0], half) if half else call(*arguments, **named)
         if half and self._error == errno.ENOSPC:
             # A full disk takes a part before it says so.

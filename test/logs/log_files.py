@@ -1,24 +1,44 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings and slow truths for the tests of logs."""
+"""Small recordings, the reader of others, and slow truths for the tests of logs."""
 
 from __future__ import annotations
 
+import os
 import struct
+import time
+from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader, SeekingReader
 
-from valveflow_ros.logs import LogContents, Message, RecordingWriter
-from valveflow_ros.logs.mcap.definitions import Definitions
-from valveflow_ros.records import SIGNALS, Readings, SampleTable, Signal
+from valveflow_ros.errors import RecordingError
+from valveflow_ros.logs import (
+    Definitions,
+    LogContents,
+    Message,
+    Recorder,
+    RecorderSettings,
+    RecorderStatus,
+    RecordingWriter,
+    open_log,
+)
+from valveflow_ros.logs.mcap.records import MAGIC, RECORD_HEAD
+from valveflow_ros.records import SIGNALS, SampleTable, Signal
 
 START_NS = 1_700_000_000_000_000_000
 FLOAT64 = 'std_msgs/msg/Float64'
 SAMPLE = 'valveflow_msgs/msg/PlantSample'
 # No ROS installation may change what a test sees.
 STOCK = Definitions([])
+QUICK = RecorderSettings(
+    flush_period_s=0.002, sync_period_s=0.01, retry_s=0.002, retry_max_s=0.01, free_floor_bytes=0
+)
+PATIENCE_S = float(os.environ.get('VALVEFLOW_TEST_PATIENCE_S', 20.0))
 
 
 class Reading(NamedTuple):
@@ -27,6 +47,13 @@ class Reading(NamedTuple):
     signal: int
     value: float
     quality: int
+
+
+class Told(NamedTuple):
+    topic: str
+    log_ns: int
+    publish_ns: int
+    data: bytes
 
 
 def float64(value: float, order: str = '<') -> bytes:
@@ -51,15 +78,13 @@ def plant_sample(
 
 
 def read_back(contents: LogContents) -> list[Reading]:
-    readings = contents.readings
-    columns = (
-        contents.log_time_ns,
-        readings.time_ns,
-        readings.signal,
-        readings.value,
-        readings.quality,
-    )
+    r = contents.readings
+    columns = contents.log_time_ns, r.time_ns, r.signal, r.value, r.quality
     return [Reading(*row) for row in zip(*(c.tolist() for c in columns), strict=True)]
+
+
+def messages_of(contents: LogContents) -> list[Told]:
+    return [Told(m.topic, *m[2:]) for m in contents.iter_messages()]
 
 
 def write_chunks(
@@ -86,28 +111,29 @@ def write_chunks(
     return (path if close else path.with_name(path.name + '.part')), wanted, writer
 
 
-def write_messages(folder: Path, topics: dict[str, str], messages: list[Message]) -> Path:
+def write_part(folder: Path, chunks: int = 20) -> tuple[Path, list[Reading]]:
+    """Write what `write_chunks` does, and leave it unfinished as a dead writer."""
+    part, wanted, writer = write_chunks(folder, chunks, close=False)
+    writer.abandon()
+    return part, wanted
+
+
+def write_messages(
+    folder: Path, topics: dict[str, str], messages: list[Message], definition: str | None = None
+) -> Path:
     with RecordingWriter(folder, definitions=STOCK) as writer:
         for topic, type_name in topics.items():
-            writer.add_topic(topic, type_name)
+            writer.add_topic(topic, type_name, definition=definition)
         for message in messages:
             writer.write(*message)
     return folder / f'{folder.name}_0.mcap'
 
 
-def same_readings(first: Readings, second: Readings) -> bool:
-    return all(
-        np.array_equal(getattr(first, name), getattr(second, name), equal_nan=name == 'value')
-        for name in ('time_ns', 'signal', 'value', 'quality')
-    )
-
-
-def same_tables(first: SampleTable, second: SampleTable) -> bool:
-    return (
-        np.array_equal(first.time_ns, second.time_ns)
-        and np.array_equal(first.values, second.values, equal_nan=True)
-        and np.array_equal(first.quality, second.quality)
-    )
+def same_arrays(first: Any, second: Any) -> bool:
+    """Return whether two records of arrays are equal, NaN to NaN."""
+    names = list(first.__dataclass_fields__)
+    pairs = [(np.asarray(getattr(r, n)) for r in (first, second)) for n in names]
+    return all(np.array_equal(a, b, equal_nan=a.dtype.kind == 'f') for a, b in pairs)
 
 
 def wander(n: int, seed: int, command: bool = False) -> SampleTable:
@@ -119,3 +145,111 @@ def wander(n: int, seed: int, command: bool = False) -> SampleTable:
         column[rng.random(n) < 0.05] = np.nan
     doubts = {s: (rng.random(n) < 0.1).astype(np.uint8) for s in columns}
     return SampleTable.from_columns(time_ns, columns, doubts)
+
+
+def stock(file: bytes | Path, seek: bool = True, sort: bool = True) -> list[Told]:
+    """Return what the library `mcap` reads, every checksum compared."""
+    return [told for told, _ in numbered(file, seek, sort)]
+
+
+def numbered(file: bytes | Path, seek: bool = True, sort: bool = True) -> list[tuple[Told, int]]:
+    """Return the same, each with its sequence number."""
+    raw = file if isinstance(file, bytes) else file.read_bytes()
+    reader = (SeekingReader if seek else NonSeekingReader)(BytesIO(raw), validate_crcs=True)
+    return [
+        (Told(channel.topic, m.log_time, m.publish_time, bytes(m.data)), m.sequence)
+        for _, channel, m in reader.iter_messages(log_time_order=sort)
+    ]
+
+
+def records(raw: bytes) -> list[tuple[int, int, int]]:
+    """Return kind, begin and end of every record of an intact file, finished or not."""
+    position, found = len(MAGIC), []
+    while position < len(raw) - len(MAGIC):
+        op, length = RECORD_HEAD.unpack_from(raw, position)
+        end = position + RECORD_HEAD.size + length
+        found.append((op, position, end))
+        position = end
+    return found
+
+
+def chunk_ends(raw: bytes) -> list[int]:
+    """Return where each chunk ends."""
+    return [end for op, _, end in records(raw) if op == Opcode.CHUNK]
+
+
+def record_heads(raw: bytes) -> list[int]:
+    """Return every byte that belongs to the kind or the length of a record."""
+    size = RECORD_HEAD.size
+    return [place for _, begin, _ in records(raw) for place in range(begin, begin + size)]
+
+
+def against_chunks(
+    found: Sequence[Any], wanted: Sequence[Any], per_chunk: int
+) -> tuple[int, list[Any]]:
+    """Return how many whole chunks are missing, and what was found that is in no whole chunk."""
+    left, missing = list(found), 0
+    for first in range(0, len(wanted), per_chunk):
+        chunk = list(wanted[first : first + per_chunk])
+        if left[: len(chunk)] == chunk:
+            left = left[len(chunk) :]
+        else:
+            missing += 1
+    return missing, left
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s, 'waited in vain'
+        time.sleep(0.001)
+
+
+def recorder_of(folder: Path, settings: RecorderSettings = QUICK, **more: Any) -> Recorder:
+    recorder = Recorder(folder, settings, definitions=STOCK, **more)
+    recorder.add_topic('/valve_opening', FLOAT64)
+    return recorder
+
+
+def record(recorder: Recorder, first: int, count: int = 1, topic: str = '/valve_opening') -> None:
+    """Hand in messages whose values are their numbers, one each nanosecond."""
+    for number in range(first, first + count):
+        recorder.record(topic, float64(number), START_NS + number, START_NS + number)
+
+
+def put(recorder: Recorder, first: int, count: int = 1) -> None:
+    """Do the same and wait until all before are on disk, too."""
+    record(recorder, first, count)
+    wait_for(lambda: recorder.status().written == first + count)
+
+
+def rotate(recorder: Recorder) -> None:
+    """Write what waits and begin a new split."""
+    wait_for(lambda: recorder.status().queued == 0)
+    finished = recorder.status().files_finished
+    recorder.rotate()
+    wait_for(lambda: recorder.status().files_finished > finished)
+
+
+def balanced(status: RecorderStatus) -> bool:
+    columns = status.written + status.queued + status.lost + status.removed
+    return status.received == columns + sum(status.dropped.values())
+
+
+def values_in(folder: Path) -> list[float]:
+    """Return the values of the one topic that a reader finds."""
+    try:
+        return open_log(folder).readings.value.tolist()
+    except RecordingError:
+        return []
+
+
+def numbers_in_chunks(raw: bytes) -> list[int]:
+    """Return the number of messages of each chunk, by the indexes that follow it."""
+    counts: list[int] = []
+    for op, begin, end in records(raw):
+        if op == Opcode.CHUNK:
+            counts.append(0)
+        elif op == Opcode.MESSAGE_INDEX:
+            counts[-1] += (end - begin - RECORD_HEAD.size - 6) // 16
+    return counts

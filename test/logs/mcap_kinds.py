@@ -7,15 +7,12 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
-from io import BytesIO
-from typing import NamedTuple
 
 import lz4.frame
 import zstandard
 from hypothesis import strategies as st
-from log_files import FLOAT64, START_NS, float64
+from log_files import FLOAT64, START_NS, Told, float64
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import (
     Attachment,
     AttachmentIndex,
@@ -44,13 +41,6 @@ CHANNELS = [
       for k, topic in enumerate(TOPICS, 1)), UNTYPED,
 ]  # fmt: skip
 FOREIGN = struct.pack('<BQ', 0x80, 5) + b'later' + struct.pack('<BQ', 0x10, 0)
-
-
-class Told(NamedTuple):
-    topic: str
-    log_ns: int
-    publish_ns: int
-    data: bytes
 
 
 @dataclass(frozen=True)
@@ -265,23 +255,3 @@ KINDS = st.builds(
     chunks=st.integers(1, 4),
     **dict.fromkeys(SWITCHES, st.booleans()),
 ).filter(Kind.legal)
-
-
-def in_file(raw: bytes) -> list[tuple[str, int, int, int, bytes]]:
-    """Return topic, times, sequence and bytes of each message, in the order of the file."""
-    messages = NonSeekingReader(BytesIO(raw), validate_crcs=True).iter_messages(
-        log_time_order=False
-    )
-    return [
-        (channel.topic, m.log_time, m.publish_time, m.sequence, bytes(m.data))
-        for _, channel, m in messages
-    ]
-
-
-def stock(raw: bytes, seek: bool = True) -> list[Told]:
-    """Return what the library `mcap` reads, checksums compared."""
-    reader = (SeekingReader if seek else NonSeekingReader)(BytesIO(raw), validate_crcs=True)
-    return [
-        Told(channel.topic, message.log_time, message.publish_time, bytes(message.data))
-        for _, channel, message in reader.iter_messages()
-    ]

@@ -17,6 +17,7 @@ from valveflow_ros.logs import open_log
 
 pytest.importorskip('pyarrow')
 HEALTH = 'diagnostic_msgs/msg/DiagnosticArray'
+ROWS = {'curves': 1, 'predictions': 5, 'alarms': 2, 'diagnoses': 1, 'health': 2}
 
 
 @pytest.fixture(scope='module')
@@ -36,40 +37,39 @@ def log(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def tables(log, tmp_path_factory):
-    folder = tmp_path_factory.mktemp('tables')
-    found = [write_outputs(log, folder / f'said{kind}') for kind in ('.csv', '.parquet')]
-    return folder, [{path.stem: n for path, n in one.items()} for one in found]
+def folder(log, tmp_path_factory):
+    """Return the tables in both forms."""
+    home = tmp_path_factory.mktemp('tables')
+    for suffix in ('.csv', '.parquet'):
+        counts = {path.name: n for path, n in write_outputs(log, home / f'said{suffix}').items()}
+        assert counts == {f'said_{kind}{suffix}': n for kind, n in ROWS.items()}
+    assert len(list(home.iterdir())) == 2 * len(ROWS)
+    return home
 
 
-def test_there_is_one_table_a_kind(tables):
-    folder, (csv, parquet) = tables
-    rows = {'curves': 1, 'predictions': 5, 'alarms': 2, 'diagnoses': 1, 'health': 2}
-    assert csv == parquet == {f'said_{kind}': n for kind, n in rows.items()}
-    assert sorted(p.name for p in folder.iterdir()) == sorted(
-        f'said_{kind}{suffix}' for kind in rows for suffix in ('.csv', '.parquet')
+def test_values_are_those_of_the_messages(log, folder):
+    curves, predictions = (
+        pd.read_parquet(folder / f'said_{kind}.parquet') for kind in ('curves', 'predictions')
     )
-
-
-def test_values_are_those_of_the_messages(log, tables):
-    folder, _ = tables
-    read = {k: pd.read_parquet(folder / f'said_{k}.parquet') for k in ('curves', 'predictions')}
     topic = '/valveflow_monitor/prediction'
     decoder = log.decoder(topic)
     wanted = [decoder.decode(m.data) for m in log.iter_messages([topic])]
-    assert list(read['predictions'].residual_mw) == [w['residual_mw'] for w in wanted]
+    assert list(predictions.residual_mw) == [w['residual_mw'] for w in wanted]
     ns = [w['header']['stamp']['sec'] * 10**9 for w in wanted]
-    assert list(read['predictions'].time.astype(np.int64)) == ns
-    (curve,) = read['curves'].itertuples()
+    assert list(predictions.time.astype(np.int64)) == ns
+    (curve,) = curves.itertuples()
     assert list(curve.breakpoints) == [1000.0, 1500.0, 2200.0]
     assert (curve.unit_tag, curve.topic) == ('U1', '/valveflow_monitor/characteristic')
     assert curve.window_end == pd.Timestamp(START_NS, tz='UTC')
     assert pd.isna(curve.shift_since)
+    # Health has a row for each item.
+    rows = pd.read_csv(folder / 'said_health.csv')
+    assert list(rows.message) == ['too old', 'recording']
+    assert json.loads(rows['values'][0]) == [{'key': 'Age of the curve (s)', 'value': '7'}]
 
 
-@pytest.mark.parametrize('kind', ['curves', 'predictions', 'alarms', 'diagnoses', 'health'])
-def test_csv_and_parquet_say_the_same(kind, tables):
-    folder, _ = tables
+@pytest.mark.parametrize('kind', ROWS)
+def test_csv_and_parquet_say_the_same(kind, folder):
     parquet = pd.read_parquet(folder / f'said_{kind}.parquet')
     csv = pd.read_csv(folder / f'said_{kind}.csv')
     assert list(csv.columns) == list(parquet.columns)
@@ -81,12 +81,6 @@ def test_csv_and_parquet_say_the_same(kind, tables):
                 assert pd.Timestamp(theirs) == ours
             else:
                 assert theirs == ours or (pd.isna(theirs) and (pd.isna(ours) or ours == ''))
-
-
-def test_health_has_a_row_for_each_item(tables):
-    rows = pd.read_csv(tables[0] / 'said_health.csv')
-    assert list(rows.message) == ['too old', 'recording']
-    assert json.loads(rows['values'][0]) == [{'key': 'Age of the curve (s)', 'value': '7'}]
 
 
 def test_a_log_without_a_monitor_is_refused(tmp_path):

@@ -3,248 +3,81 @@
 """The recorder's account against what is found on the disk, whatever the disk does."""
 
 import errno
-import os
 import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import yaml
-from fault_points import Faults
-from log_files import FLOAT64, START_NS, STOCK, float64, write_chunks
+from fault_points import SHORT, Faults
+from log_files import (
+    FLOAT64,
+    PATIENCE_S,
+    QUICK,
+    START_NS,
+    STOCK,
+    balanced,
+    float64,
+    put,
+    record,
+    recorder_of,
+    rotate,
+    values_in,
+    wait_for,
+    write_chunks,
+    write_part,
+)
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs import (
-    LATCHED,
-    Recorder,
-    RecorderSettings,
-    RecorderState,
-    open_log,
-)
+from valveflow_ros.logs import LATCHED, Message, Recorder, RecorderState, RecordingWriter, open_log
 from valveflow_ros.logs.part_file import PartFile, is_held
 
-QUICK = RecorderSettings(
-    flush_period_s=0.002, sync_period_s=0.01, retry_s=0.002, retry_max_s=0.01, free_floor_bytes=0
-)
-LIMIT_S = float(os.environ.get('VALVEFLOW_TEST_PATIENCE_S', 20.0))
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / 'log'
 
 
-def wait_for(condition):
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end, 'waited in vain'
-        time.sleep(0.001)
-
-
-class Disk:
-    """Opens files that fail as they are told, counting every call."""
-
-    def __init__(self, fails=lambda call: None):
-        self.fails = fails
-        self.calls = 0
-        self.lock = threading.Lock()
-
-    def __call__(self, path):
-        self.count('open', b'')
-        return FailingFile(self, PartFile(path))
-
-    def count(self, name, data):
-        with self.lock:
-            self.calls += 1
-            call = self.calls
-        error = self.fails(call)
-        if error is not None:
-            raise OSError(error, 'no luck')
-        return data
-
-
-class FailingFile:
-    def __init__(self, disk, file):
-        self.disk = disk
-        self.file = file
-
-    def write(self, data):
-        try:
-            self.disk.count('write', data)
-        except OSError:
-            # As a full disk does, take a part before saying so.
-            self.file.write(data[: len(data) // 2])
-            raise
-        return self.file.write(data)
-
-    def sync(self):
-        self.disk.count('sync', b'')
-        self.file.sync()
-
-    @property
-    def touched(self):
-        return self.file.touched
-
-    def check(self, size):
-        self.file.check(size)
-
-    def check_content(self, size, crc):
-        self.file.check_content(size, crc)
-
-    def publish(self):
-        self.disk.count('publish', b'')
-        self.file.publish()
-
-    def close(self):
-        self.file.close()
-
-    def discard(self):
-        self.file.discard()
-
-
-class ShortFile(FailingFile):
-    """Takes at most seven bytes at once."""
-
-    def write(self, data):
-        return self.file.write(data[:7])
-
-
-def recorder_of(folder, settings=QUICK, **options):
-    recorder = Recorder(folder, settings, definitions=STOCK, **options)
-    recorder.add_topic('/valve_opening', FLOAT64)
-    return recorder
-
-
-def record(recorder, first, count, topic='/valve_opening'):
-    for number in range(first, first + count):
-        time_ns = START_NS + number
-        recorder.record(topic, float64(number), time_ns, time_ns)
-
-
-def values_on_disk(folder):
-    try:
-        return open_log(folder).readings.value.tolist()
-    except RecordingError:
-        return []
-
-
-def is_balanced(status):
-    columns = status.written + status.queued + status.lost + status.removed
-    columns += sum(status.dropped.values())
-    return status.received == columns
-
-
-def test_all_that_is_handed_in_is_on_disk(tmp_path):
-    recorder = recorder_of(tmp_path / 'log', attachments={'parameters.yaml': b'a: 1\n'})
+def test_all_that_is_handed_in_is_on_disk(folder):
+    recorder = recorder_of(folder, attachments={'parameters.yaml': b'a: 1\n'})
     record(recorder, 0, 5000)
     status = recorder.close()
     assert (status.state, status.reason) == (RecorderState.STOPPED, '')
     assert status.received == status.written == 5000
     assert (status.queued, status.lost, status.dropped) == (0, 0, {})
     assert (status.files_finished, status.recovered) == (1, ())
-    assert values_on_disk(tmp_path / 'log') == list(range(5000))
-    contents = open_log(tmp_path / 'log')
+    assert values_in(folder) == list(range(5000))
+    contents = open_log(folder)
     assert contents.attachments == {'parameters.yaml': b'a: 1\n'}
     assert contents.metadata['valveflow_recorder'] == {'received': '5000'}
-    path = tmp_path / 'log' / 'log_0.mcap'
-    assert status.bytes_written == path.stat().st_size
+    assert status.bytes_written == (folder / 'log_0.mcap').stat().st_size
 
 
-def test_what_was_flushed_is_readable_while_recording(tmp_path):
-    recorder = recorder_of(tmp_path / 'log')
-    record(recorder, 0, 100)
-    wait_for(lambda: recorder.status().written == 100)
-    assert recorder.status().file == 'log_0.mcap.part'
-    assert (tmp_path / 'log' / recorder.status().file).is_file()
-    assert values_on_disk(tmp_path / 'log') == list(range(100))
-    assert recorder.close().written == 100
-
-
-def test_what_somebody_waits_for_is_on_disk_before_its_time(tmp_path):
-    recorder = recorder_of(tmp_path / 'log', replace(QUICK, flush_period_s=600.0))
+def test_what_somebody_waits_for_is_on_disk_before_its_time(folder):
+    recorder = recorder_of(folder, replace(QUICK, flush_period_s=600.0))
     for first in (0, 100, 200):
         record(recorder, first, 100)
-        assert recorder.flush(20.0)
-        assert values_on_disk(tmp_path / 'log') == list(range(first + 100))
+        assert recorder.flush(PATIENCE_S)
+        assert recorder.status().file == 'log_0.mcap.part'
+        assert values_in(folder) == list(range(first + 100))
     assert recorder.flush(0.0)
-    assert recorder.close().written == 300
+    # A burst does not pile up until its time has come.
+    record(recorder, 300, 10_000)
+    wait_for(lambda: recorder.status().written >= 4000)
+    assert recorder.close().written == 10_300
     # There is nobody left to write what comes now.
-    record(recorder, 300, 1)
-    assert not recorder.flush(20.0)
+    record(recorder, 0)
+    assert not recorder.flush(PATIENCE_S)
 
 
-def test_nobody_waits_longer_for_a_disk_than_told(tmp_path):
-    disk = Disk(lambda number: errno.ENOSPC)
-    recorder = recorder_of(tmp_path / 'log', open_file=disk)
-    record(recorder, 0, 10)
-    begun_s = time.monotonic()
-    assert not recorder.flush(0.2)
-    assert 0.2 <= time.monotonic() - begun_s < 20.0
-    recorder.close()
-
-
-@pytest.mark.parametrize('error', [errno.ENOSPC, errno.EIO])
-@pytest.mark.parametrize('call', range(1, 26))
-def test_one_failing_call_loses_nothing(tmp_path, call, error):
-    disk = Disk(lambda number: error if number == call else None)
-    recorder = recorder_of(tmp_path / 'log', open_file=disk)
-    for part in range(8):
-        record(recorder, 20 * part, 20)
-        wait_for(lambda part=part: recorder.status().written == 20 * (part + 1))
-        assert is_balanced(recorder.status())
-        if part % 3 == 2:
-            recorder.rotate()
-    status = recorder.close()
-    assert disk.calls >= call
-    assert (status.written, status.lost) == (160, 0)
-    assert values_on_disk(tmp_path / 'log') == list(range(160))
-
-
-def test_a_disk_that_often_fails_keeps_an_exact_account(tmp_path):
-    disk = Disk(lambda number: errno.EIO if number % 7 == 0 else None)
-    recorder = recorder_of(tmp_path / 'log', open_file=disk)
-    for part in range(30):
-        record(recorder, 10 * part, 10)
-        wait_for(lambda part=part: recorder.status().written == 10 * (part + 1))
-    status = recorder.close()
-    assert is_balanced(status)
-    assert (status.written, status.lost) == (300, 0)
-    assert values_on_disk(tmp_path / 'log') == list(range(300))
-
-
-def test_a_disk_that_always_fails_loses_what_it_says(tmp_path):
-    disk = Disk(lambda number: errno.ENOSPC)
-    recorder = recorder_of(tmp_path / 'log', open_file=disk)
-    record(recorder, 0, 50)
-    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
-    status = recorder.status()
-    assert 'cannot be written' in status.reason
-    assert (status.received, status.written, status.queued) == (50, 0, 50)
-    status = recorder.close()
-    assert (status.state, status.lost, status.written) == (RecorderState.STOPPED, 50, 0)
-    assert is_balanced(status)
-    assert list((tmp_path / 'log').glob('*.mcap*')) == []
-
-
-def test_a_file_begins_anew_when_space_returns(tmp_path):
-    full = threading.Event()
-    disk = Disk(lambda number: errno.ENOSPC if full.is_set() else None)
-    recorder = recorder_of(tmp_path / 'log', open_file=disk)
-    record(recorder, 0, 40)
-    wait_for(lambda: recorder.status().written == 40)
-    full.set()
-    record(recorder, 40, 40)
-    wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
-    full.clear()
-    wait_for(lambda: recorder.status().written == 80)
-    wait_for(lambda: recorder.status().state == RecorderState.RECORDING)
-    assert recorder.close().lost == 0
-    names = sorted(p.name for p in (tmp_path / 'log').glob('*.mcap*'))
-    assert names == ['log_0.mcap.part', 'log_1.mcap']
-    assert values_on_disk(tmp_path / 'log') == list(range(80))
-
-
+@pytest.mark.parametrize('once', [False, True])
 @pytest.mark.parametrize('call', range(1, 61))
-def test_whatever_call_fails_every_whole_file_is_listed(tmp_path, call):
+def test_whatever_call_fails_nothing_is_lost_and_every_whole_file_is_listed(folder, call, once):
     """A file that has its name is named in metadata.yaml, and a lock is never kept."""
-    folder = tmp_path / 'log'
-    faults = Faults('recorder', call, errno.EIO)
+    error = (errno.EIO, errno.ENOSPC, SHORT)[call % 3] if once else errno.EIO
+    faults = Faults('recorder', call, error, once)
     with faults.active():
         recorder = recorder_of(folder)
         for part in range(6):
@@ -259,33 +92,61 @@ def test_whatever_call_fails_every_whole_file_is_listed(tmp_path, call):
             if faults.failed_at_s is not None:
                 faults.heal()
             wait_for(settled)
+            assert balanced(recorder.status())
         status = recorder.close()
+    assert faults.failed_at_s is not None
     assert (status.state, status.reason, status.written) == (RecorderState.STOPPED, '', 30)
     listed = yaml.safe_load((folder / 'metadata.yaml').read_text())
     names = listed['rosbag2_bagfile_information']['relative_file_paths']
     assert sorted(names) == sorted(p.name for p in folder.glob('*.mcap'))
     assert not any(is_held(part) for part in folder.glob('*.part'))
-    assert values_on_disk(folder) == list(range(30))
+    assert values_in(folder) == list(range(30))
 
 
-def test_writes_of_a_few_bytes_are_put_together(tmp_path):
-    disk = Disk()
-    recorder = recorder_of(tmp_path / 'log', open_file=lambda p: ShortFile(disk, PartFile(p)))
-    record(recorder, 0, 100)
-    assert recorder.close().written == 100
-    assert open_log(tmp_path / 'log').warnings == ()
-    assert values_on_disk(tmp_path / 'log') == list(range(100))
+def test_a_full_disk_keeps_all_waiting_until_space_returns(folder):
+    recorder = recorder_of(folder)
+    put(recorder, 0, 40)
+    faults = Faults('recorder', 1, errno.ENOSPC)
+    with faults.active():
+        record(recorder, 40, 50)
+        wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
+        status = recorder.status()
+        assert 'cannot be written' in status.reason
+        assert (status.received, status.written, status.queued) == (90, 40, 50)
+        begun_s = time.monotonic()
+        assert not recorder.flush(0.1), 'nobody waits longer than told'
+        assert 0.1 <= time.monotonic() - begun_s < PATIENCE_S
+        faults.heal()
+        wait_for(lambda: recorder.status().written == 90)
+        wait_for(lambda: recorder.status().state == RecorderState.RECORDING)
+    assert recorder.close().lost == 0
+    assert sorted(p.name for p in folder.glob('*.mcap*')) == ['log_0.mcap.part', 'log_1.mcap']
+    assert values_in(folder) == list(range(90))
 
 
-def test_too_many_waiting_messages_are_dropped_by_topic_and_counted(tmp_path):
-    gate = threading.Event()
+def test_what_never_came_to_a_disk_is_lost_and_said(folder):
+    with Faults('recorder', 1, errno.ENOSPC).active():
+        recorder = recorder_of(folder)
+        record(recorder, 0, 50)
+        status = recorder.close()
+    assert (status.state, status.lost, status.written) == (RecorderState.STOPPED, 50, 0)
+    assert balanced(status)
+    assert list(folder.glob('*.mcap*')) == []
 
-    def slow(path):
-        gate.wait(LIMIT_S)
+
+def gated(gate):
+    """Return what opens files only after a gate has."""
+
+    def opened(path):
+        gate.wait(PATIENCE_S)
         return PartFile(path)
 
-    settings = RecorderSettings(queue_limit=30, flush_period_s=0.002, free_floor_bytes=0)
-    recorder = recorder_of(tmp_path / 'log', settings, open_file=slow)
+    return opened
+
+
+def test_too_many_waiting_messages_are_dropped_by_topic_and_counted(folder):
+    gate = threading.Event()
+    recorder = recorder_of(folder, replace(QUICK, queue_limit=30), open_file=gated(gate))
     recorder.add_topic('/generated_power', FLOAT64)
     record(recorder, 0, 25)
     record(recorder, 25, 10, '/generated_power')
@@ -296,84 +157,96 @@ def test_too_many_waiting_messages_are_dropped_by_topic_and_counted(tmp_path):
     assert (status.received, status.queued) == (43, 30)
     gate.set()
     wait_for(lambda: recorder.status().written == 30)
-    status = recorder.close()
-    assert is_balanced(status)
-    assert values_on_disk(tmp_path / 'log') == list(range(30))
-    notes = open_log(tmp_path / 'log').metadata['valveflow_recorder']
-    assert notes == {
-        'received': '43',
-        'dropped /generated_power': '5',
-        'dropped /valve_opening': '8',
-    }
+    assert balanced(recorder.close())
+    assert values_in(folder) == list(range(30))
+    notes = {'received': '43', 'dropped /generated_power': '5', 'dropped /valve_opening': '8'}
+    assert open_log(folder).metadata['valveflow_recorder'] == notes
 
 
-def test_asking_for_a_split_of_nothing_does_nothing(tmp_path):
-    recorder = recorder_of(tmp_path / 'log')
+def test_closing_takes_a_bounded_time_and_later_messages_are_counted(folder):
+    gate = threading.Event()
+    recorder = recorder_of(folder, open_file=gated(gate))
+    record(recorder, 0, 10)
+    begun_s = time.monotonic()
+    status = recorder.close(timeout_s=0.05)
+    assert time.monotonic() - begun_s < 2.0
+    assert (status.queued, status.written) == (10, 0)
+    assert not recorder.record('/valve_opening', float64(0), START_NS, START_NS)
+    gate.set()
+    status = recorder.close(PATIENCE_S)
+    assert (status.written, status.lost, status.dropped) == (10, 0, {'/valve_opening': 1})
+    assert balanced(status)
+
+
+def test_asking_for_a_split_of_nothing_does_nothing(folder):
+    recorder = recorder_of(folder)
     recorder.rotate()
     wait_for(lambda: not recorder.is_rotating)
-    record(recorder, 0, 5)
-    wait_for(lambda: recorder.status().written == 5)
+    put(recorder, 0, 5)
     record(recorder, 5, 5)
     assert recorder.close().files_finished == 1
 
 
-def test_a_hundred_rotations_lose_nothing(tmp_path):
-    recorder = recorder_of(tmp_path / 'log')
-    for part in range(100):
-        record(recorder, 10 * part, 10)
-        recorder.rotate()
+@pytest.mark.parametrize('limits', [{'rotate_bytes': 1}, {'rotate_s': 0.0}, {}])
+def test_rotations_by_size_by_age_and_on_request_lose_nothing(folder, limits):
+    recorder = recorder_of(folder, replace(QUICK, **limits))
+    for part in range(20):
+        record(recorder, part)
+        if not limits:
+            rotate(recorder)
         wait_for(lambda part=part: recorder.status().files_finished == part + 1)
-    status = recorder.close()
-    assert status.files_finished == 100
-    assert values_on_disk(tmp_path / 'log') == list(range(1000))
+    recorder.close()
+    assert len(list(folder.glob('*.mcap'))) == 20
+    assert values_in(folder) == list(range(20))
 
 
-def test_rotation_by_size_and_by_age(tmp_path):
-    for name, limits in (('size', {'rotate_bytes': 1}), ('age', {'rotate_s': 0.0})):
-        settings = RecorderSettings(flush_period_s=0.002, free_floor_bytes=0, **limits)
-        recorder = recorder_of(tmp_path / name, settings)
-        for part in range(3):
-            record(recorder, part, 1)
-            wait_for(lambda part=part, r=recorder: r.status().files_finished == part + 1)
-        recorder.close()
-        assert len(list((tmp_path / name).glob('*.mcap'))) == 3
-        assert values_on_disk(tmp_path / name) == [0.0, 1.0, 2.0]
-
-
-def test_latched_messages_head_every_later_split(tmp_path):
-    recorder = recorder_of(tmp_path / 'log')
+def test_latched_messages_head_every_later_split(folder):
+    recorder = recorder_of(folder)
     recorder.add_topic('/curve', FLOAT64, qos=(LATCHED,), latched=True)
     record(recorder, 0, 2, '/curve')
     for part in range(3):
-        record(recorder, 10 + 10 * part, 2)
-        wait_for(lambda part=part: recorder.status().queued == 0)
-        recorder.rotate()
-        wait_for(lambda part=part: recorder.status().files_finished == part + 1)
-    record(recorder, 50, 1)
-    status = recorder.close()
-    assert status.written == 9
+        put(recorder, 2 + 2 * part, 2)
+        rotate(recorder)
+    record(recorder, 50)
+    assert recorder.close().written == 9
     for number in (1, 2, 3):
-        first = next(open_log(tmp_path / 'log' / f'log_{number}.mcap').iter_messages())
+        first = next(open_log(folder / f'log_{number}.mcap').iter_messages())
         assert (first.topic, first.data) == ('/curve', float64(1))
-    curves = list(open_log(tmp_path / 'log').iter_messages(['/curve']))
+    curves = list(open_log(folder).iter_messages(['/curve']))
     assert [m.data for m in curves] == [float64(0), float64(1)]
 
 
-def test_the_oldest_files_go_when_told_so(tmp_path):
-    folder = tmp_path / 'log'
-    settings = RecorderSettings(flush_period_s=0.002, free_floor_bytes=0, keep_files=2)
+@pytest.mark.parametrize('before', [0, 1])
+def test_a_head_message_keeps_its_own_number_when_a_newer_one_waits(folder, before):
+    """In the first flush of a split its latched topic speaks already: each message comes once."""
+    latched = []
+    with RecordingWriter(folder, definitions=STOCK, head_messages=lambda: latched) as writer:
+        for topic in ('/latched', '/other'):
+            writer.add_topic(topic, FLOAT64)
+        first = Message('/latched', float64(0), START_NS, START_NS)
+        writer.write(*first)
+        writer.rotate()
+        latched.append(first)
+        numbers = [*range(1, 1 + before), 8, 9]
+        for k in numbers:
+            topic = '/latched' if k > 1 else '/other'
+            writer.write(topic, float64(k), START_NS + k, START_NS + k)
+    found = [m.data for m in open_log(folder).iter_messages()]
+    assert found == [float64(k) for k in (0, *numbers)]
+
+
+def test_the_oldest_files_go_when_told_so(folder):
     folder.mkdir()
-    whole, _, _ = write_chunks(tmp_path / 'other', chunks=1)
-    for name in ('other.mcap', 'other_0.mcap', 'log_x.mcap', 'xlog_0.mcap'):
+    whole, _, _ = write_chunks(folder.parent / 'other', chunks=1)
+    for name in ('other.mcap', 'other_0.mcap', 'log_x.mcap', 'xlog_0.mcap', 'log_000.mcap'):
         (folder / name).write_bytes(whole.read_bytes())
     bystanders = {p.name for p in folder.iterdir()}
-    recorder = recorder_of(folder, settings)
+    recorder = recorder_of(folder, replace(QUICK, keep_files=2))
     for part in range(5):
-        record(recorder, part, 1)
-        wait_for(lambda part=part: recorder.status().queued == 0)
-        recorder.rotate()
-        wait_for(lambda part=part: recorder.status().files_finished == part + 1)
-    recorder.close()
+        record(recorder, part)
+        rotate(recorder)
+    status = recorder.close()
+    assert (status.written, status.removed, balanced(status)) == (2, 3, True)
     left = {p.name for p in folder.glob('*.mcap')}
     assert left - bystanders == {'log_4.mcap', 'log_5.mcap'}
     assert left >= bystanders
@@ -382,44 +255,67 @@ def test_the_oldest_files_go_when_told_so(tmp_path):
     assert found.readings.value[found.readings.signal == 0].tolist()[-2:] == [3.0, 4.0]
 
 
-def test_it_stops_before_the_disk_is_full_and_goes_on_afterwards(tmp_path):
+def test_an_old_file_that_cannot_be_removed_is_said_and_recording_goes_on(folder, monkeypatch):
+    # A retry so late that what is said can be seen.
+    recorder = recorder_of(folder, replace(QUICK, keep_files=1, retry_s=0.5, retry_max_s=0.5))
+    unlink, stuck = Path.unlink, [True]
+
+    def sticky(path, missing_ok=False):
+        if stuck and path.name == 'log_0.mcap':
+            raise PermissionError(errno.EPERM, 'Operation not permitted')
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, 'unlink', sticky)
+    for k in range(2):
+        record(recorder, k)
+        rotate(recorder)
+    wait_for(lambda: 'cannot be removed (Operation not permitted)' in recorder.status().reason)
+    stuck.clear()
+    record(recorder, 2)
+    rotate(recorder)
+    recorder.close()
+    assert values_in(folder) == [2]
+
+
+def test_it_stops_before_the_disk_is_full_and_goes_on_afterwards(folder):
     free = [10**12]
-    settings = RecorderSettings(
-        flush_period_s=0.002, retry_s=0.002, retry_max_s=0.01, free_floor_bytes=10**9
-    )
-    recorder = recorder_of(tmp_path / 'log', settings, free_bytes=lambda folder: free[0])
-    record(recorder, 0, 10)
-    wait_for(lambda: recorder.status().written == 10)
+    settings = replace(QUICK, free_floor_bytes=10**9)
+
+    def free_bytes(_):
+        if not free:
+            raise OSError(errno.EIO, 'Input/output error')
+        return free[0]
+
+    recorder = recorder_of(folder, settings, free_bytes=free_bytes)
+    put(recorder, 0, 10)
     free[0] = 10**8
     wait_for(lambda: recorder.status().state == RecorderState.DEGRADED)
     assert 'MiB must stay free' in recorder.status().reason
-    assert [p.name for p in (tmp_path / 'log').glob('*.mcap*')] == ['log_0.mcap']
+    assert [p.name for p in folder.glob('*.mcap*')] == ['log_0.mcap']
+    free.clear()
+    wait_for(lambda: 'cannot be asked for space' in recorder.status().reason)
     record(recorder, 10, 10)
-    free[0] = 10**12
+    free.append(10**12)
     wait_for(lambda: recorder.status().written == 20)
     recorder.close()
-    assert values_on_disk(tmp_path / 'log') == list(range(20))
+    assert values_in(folder) == list(range(20))
 
 
-def test_leftovers_are_finished_at_the_start(tmp_path):
-    part, wanted, writer = write_chunks(tmp_path / 'log', close=False)
-    writer.abandon()
-    assert part.exists()
-    recorder = Recorder(tmp_path / 'log', QUICK, definitions=STOCK)
+def test_leftovers_are_finished_at_the_start(folder):
+    _, wanted = write_part(folder)
+    recorder = Recorder(folder, QUICK, definitions=STOCK)
     wait_for(lambda: recorder.status().recovered)
     recorder.add_topic('/unit1/valve_opening', FLOAT64)
     record(recorder, 0, 3, '/unit1/valve_opening')
-    status = recorder.close()
-    assert status.recovered[0].messages == len(wanted)
-    names = sorted(p.name for p in (tmp_path / 'log').iterdir())
+    assert recorder.close().recovered[0].messages == len(wanted)
+    names = sorted(p.name for p in folder.iterdir())
     assert names == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
-    assert len(open_log(tmp_path / 'log').readings) == len(wanted) + 3
+    assert len(open_log(folder).readings) == len(wanted) + 3
 
 
 @pytest.mark.parametrize('problem', [PermissionError(13, 'no'), OSError(errno.EIO, 'bad sector')])
-def test_a_leftover_that_cannot_be_read_holds_up_nothing(tmp_path, monkeypatch, problem):
+def test_a_leftover_that_cannot_be_read_holds_up_nothing(folder, monkeypatch, problem):
     """It may be another user's, or lie on a bad sector."""
-    folder = tmp_path / 'log'
     folder.mkdir()
     part = folder / 'log_3.mcap.part'
     part.write_bytes(b'whatever')
@@ -437,50 +333,77 @@ def test_a_leftover_that_cannot_be_read_holds_up_nothing(tmp_path, monkeypatch, 
     assert (folder / 'log_4.mcap').exists()
 
 
-def test_closing_takes_a_bounded_time_and_later_messages_are_counted(tmp_path):
-    gate = threading.Event()
-
-    def stuck(path):
-        gate.wait(LIMIT_S)
-        return PartFile(path)
-
-    recorder = recorder_of(tmp_path / 'log', open_file=stuck)
-    record(recorder, 0, 10)
-    begin = time.monotonic()
-    status = recorder.close(timeout_s=0.05)
-    assert time.monotonic() - begin < 2.0
-    assert (status.queued, status.written) == (10, 0)
-    assert not recorder.record('/valve_opening', float64(0), START_NS, START_NS)
-    gate.set()
-    status = recorder.close(LIMIT_S)
-    assert (status.written, status.lost, status.dropped) == (10, 0, {'/valve_opening': 1})
-    assert is_balanced(status)
-
-
-def test_an_error_nobody_thought_of_stops_it_visibly(tmp_path):
+def test_an_error_nobody_thought_of_stops_it_visibly(folder):
     def broken(path):
         raise ZeroDivisionError('a mistake')
 
-    recorder = recorder_of(tmp_path / 'log', open_file=broken)
-    record(recorder, 0, 1)
+    recorder = recorder_of(folder, open_file=broken)
+    record(recorder, 0)
     wait_for(lambda: recorder.status().state == RecorderState.STOPPED)
     status = recorder.status()
     assert 'ZeroDivisionError' in status.reason
-    assert (status.lost, is_balanced(status)) == (1, True)
+    assert (status.lost, balanced(status)) == (1, True)
     assert not recorder.record('/valve_opening', float64(0), START_NS, START_NS)
 
 
-def test_misuse_is_one_sentence(tmp_path):
-    recorder = recorder_of(tmp_path / 'log')
+def test_misuse_is_one_sentence(folder):
+    recorder = recorder_of(folder)
+    last = (1 << 63) - 1
     with pytest.raises(InputError, match="'/gone' was not made known"):
         recorder.record('/gone', b'', 0, 0)
-    with pytest.raises(InputError, match='impossible time'):
-        recorder.record('/valve_opening', float64(0), -1, 0)
+    for times in ((-1, 0), (0, -1), (last + 1, 0), (0, last + 1)):
+        with pytest.raises(InputError, match='impossible time'):
+            recorder.record('/valve_opening', float64(0), *times)
     with pytest.raises(InputError, match='is recorded as'):
         recorder.add_topic('/valve_opening', 'std_msgs/msg/Bool')
     with pytest.raises(RecordingError, match='was not found'):
         recorder.add_topic('/other', 'std_msgs/msg/Nothing')
-    assert recorder.close().received == 0
-    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match="message type 'x_msgs/msg/Bad'"):
+        recorder.add_topic('/bad', 'x_msgs/msg/Bad', definition='no_such_type[ value')
+    for times in ((0, 5), (5, 0), (last, 5), (5, last)):
+        assert recorder.record('/valve_opening', float64(0), *times)
+    assert recorder.close().written == 4
+    (folder.parent / 'file').write_text('')
     with pytest.raises(RecordingError, match='cannot be made'):
-        Recorder(tmp_path / 'file' / 'log')
+        Recorder(folder.parent / 'file' / 'log')
+
+
+def test_only_what_was_asked_for_is_repeated_and_a_hash_is_made_where_none_is_given(folder):
+    deep, given = folder / 'deep', 'RIHS01_' + '0' * 64
+    recorder = recorder_of(deep, name='mine', metadata={'m': {'a': 'b'}})
+    recorder.add_topic('/hashed', FLOAT64, type_hash=given)
+    recorder.add_topic('/own', 'x_msgs/msg/Own', definition='float64 data\n')
+    # Again changes nothing, whatever else is said.
+    other = {'definition': 'nonsense[', 'latched': True, 'type_hash': given}
+    recorder.add_topic('/own', 'x_msgs/msg/Own', **other)
+    topics = ['/hashed', '/own', '/valve_opening']
+    for part in range(2):
+        for topic in topics:
+            assert recorder.record(topic, float64(part), START_NS + part, START_NS) is True
+        rotate(recorder)
+    status = recorder.close(PATIENCE_S)
+    assert (status.state, status.written) == (RecorderState.STOPPED, 6)
+    assert recorder.record('/own', float64(0), START_NS, START_NS) is False
+    found = open_log(deep)
+    assert [m.topic for m in found.iter_messages()] == topics * 2
+    # The second split alone: nothing of the first stands at its head.
+    second = list(open_log(deep / 'mine_1.mcap').iter_messages())
+    assert [(m.topic, m.data) for m in second] == [(t, float64(1)) for t in topics]
+    hashes = {topic: found.topics[topic].type_hash for topic in topics}
+    assert hashes['/hashed'] == given
+    assert hashes['/valve_opening'] == STOCK.type_hash(FLOAT64) != hashes['/own'] != given
+    assert hashes['/own'].startswith('RIHS01_')
+    assert found.topics['/own'].definition == 'float64 data\n'
+    assert found.metadata['m'] == {'a': 'b'}
+    assert all(p.name.startswith('mine_') for p in deep.glob('*.mcap'))
+    assert deep.stat().st_mode & 0o777 == 0o700
+    assert recorder.folder == deep
+
+
+def test_numbers_of_a_continued_folder_are_others_than_before(folder):
+    for k in range(3):
+        with RecordingWriter(folder, name='log', definitions=STOCK) as writer:
+            writer.add_topic('/a', FLOAT64)
+            # Equal but for the number: three messages, not a message and two repetitions.
+            writer.write('/a', float64(5), START_NS + k, START_NS)
+    assert [m.data for m in open_log(folder).iter_messages()] == [float64(5)] * 3

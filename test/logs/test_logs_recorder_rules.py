@@ -5,172 +5,114 @@
 from __future__ import annotations
 
 import itertools
-import struct
-import time
+import threading
 from collections import Counter
-from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
 
 import pytest
-from damage import records
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_files import FLOAT64, START_NS, STOCK, float64
-from mcap.opcode import Opcode
+from log_files import FLOAT64, STOCK
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs import (
-    Message,
-    Recorder,
-    RecorderSettings,
-    RecorderState,
-    RecordingWriter,
-    open_log,
-)
+from valveflow_ros.logs import RecorderSettings, RecorderState, RecordingWriter, open_log
 from valveflow_ros.logs.mcap import recorder
-from valveflow_ros.logs.mcap.recorder import (
-    DROPS_SHOWN_S,
-    NewTopic,
-    RecorderCounters,
-    RecorderLoop,
-)
-from valveflow_ros.logs.mcap.writer import Qos
+from valveflow_ros.logs.mcap.recorder import DROPS_SHOWN_S, RecorderCounters
 
 STEP_S = 7.0
-
-
-class Finished(NamedTuple):
-    name: str
 
 
 class Clock:
     """Stands still until it is moved."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 1000.0
 
-    def monotonic(self) -> float:
+    def monotonic(self):
         return self.now
 
 
-class Writer:
-    """Takes its time for everything, notes when it was called, and fails where it is told to."""
+class Writer(RecordingWriter):
+    """Notes when it was called, takes its time, and fails where it is told to."""
 
-    def __init__(self, clock: Clock, folder: Path, takes_s: float = 0.0) -> None:
-        self.clock, self.takes_s = clock, takes_s
-        self.name, self._folder = 'log', folder
-        self.calls: list[tuple[str, float]] = []
-        self.bad: set[str] = set()
-        self.before: Any = lambda: None
-        self.path: Path | None = None
-        self.written = self.waiting = self.file_bytes = 0
-        self.bytes_finished = self.files_finished = 0
-        self.lost = self.removed = 0
-        self.loss = ''
-        self.finished: list[Finished] = []
-        self.noted: dict[str, Any] = {}
-        self.took: list[tuple[Any, ...]] = []
+    def __init__(self, clock, folder, takes_s=0.0):
+        super().__init__(folder, name='log', definitions=STOCK)
+        super().add_topic('/a', FLOAT64)
+        self.clock, self.takes_s, self.inside = clock, takes_s, False
+        self.calls = []
+        self.bad = set()
+        self.before = lambda: None
+        for name in ('write', 'flush', 'sync', 'rotate', 'close', 'note', 'abandon'):
+            setattr(self, name, self._noting(name, getattr(self, name)))
 
-    def _called(self, name: str) -> None:
-        self.before()
-        self.calls.append((name, self.clock.now))
-        self.clock.now += self.takes_s
-        if name in self.bad:
-            raise RecordingError('log', f'{name} failed')
+    def _noting(self, name, real):
+        def noting(*given):
+            if self.inside:
+                return real(*given)
+            self.before()
+            self.calls.append((name, self.clock.now))
+            self.clock.now += self.takes_s
+            if name in self.bad:
+                raise RecordingError('log', f'{name} failed')
+            self.inside = True
+            try:
+                return real(*given)
+            finally:
+                self.inside = False
 
-    def at(self, name: str) -> list[float]:
+        return noting
+
+    def at(self, name):
         return [at for called, at in self.calls if called == name]
-
-    def add_topic(self, topic: str, type_name: str, **more: Any) -> None:
-        self._called('add_topic')
-        self.took.append((topic, type_name, more))
-
-    def write(self, *message: Any) -> None:
-        self._called('write')
-        self.took.append(message)
-        self.waiting += 1
-
-    def flush(self) -> None:
-        self._called('flush')
-        if self.waiting:
-            self.path = self.path or self._folder / f'log_{self.files_finished}.mcap'
-            self.written, self.file_bytes = self.written + self.waiting, self.file_bytes + 100
-            self.waiting = 0
-
-    def check(self) -> None:
-        """Nobody touches what is not there."""
-
-    def check_finished(self, most_bytes: int = 0) -> bool:
-        return True
-
-    def sync(self) -> None:
-        self._called('sync')
-
-    def rotate(self) -> None:
-        self._called('rotate')
-        assert self.path is not None
-        self.path.write_bytes(b'')
-        self.finished.append(Finished(self.path.name))
-        self.bytes_finished += self.file_bytes
-        self.files_finished += 1
-        self.path, self.file_bytes = None, 0
-
-    def close(self) -> None:
-        self._called('close')
-        if self.path is not None:
-            self.rotate()
-
-    def abandon(self) -> None:
-        self._called('abandon')
-
-    def note(self, name: str, items: Any) -> None:
-        self._called('note')
-        self.noted[name] = dict(items)
-
-    def forget(self, name: str) -> None:
-        self._called('forget')
-        self.finished.remove(Finished(name))
 
 
 class Stage:
-    """A loop whose thread never runs: the test is the thread."""
+    """A recorder whose thread never runs: the test is the thread."""
 
-    def __init__(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, takes_s: float = 0.0, **given: Any
-    ) -> None:
-        self.clock = Clock()
+    def __init__(self, folder, monkeypatch, takes_s=0.0, **given):
+        self.folder, self.clock = folder, Clock()
         monkeypatch.setattr(recorder, 'time', self.clock)
+        monkeypatch.setattr(threading.Thread, 'start', lambda _: None)
         asked = {'free_floor_bytes': 0, 'sync_period_s': 0.0, **given}
-        self.settings = RecorderSettings(**asked)
+        self.recorder = recorder.Recorder(
+            folder, RecorderSettings(**asked), definitions=STOCK, free_bytes=lambda _: 1 << 50
+        )
         self.counters = RecorderCounters(10**6, clock=self.clock.monotonic)
+        self.recorder._counters = self.counters
+        self.recorder.add_topic('/a', FLOAT64)
         self.writer = Writer(self.clock, folder, takes_s)
-        self.free = 1 << 50
         self.made = 0
 
-        def made(**_: Any) -> Any:
+        def made():
             self.made += 1
             return self.writer
 
-        self.loop = RecorderLoop(folder, self.settings, made, self.counters, lambda _: self.free)
+        self.recorder._make_writer = made
 
-    def put(self, count: int = 1, topic: str = '/a') -> None:
+    def put(self, count=1, topic='/a'):
         for _ in range(count):
-            assert self.counters.admit(topic)
-            self.loop.put(Message(topic, b'', 1, 1))
+            assert self.recorder.record(topic, b'', 1, 1)
 
-    def cycle(self, stopping: bool = False) -> None:
-        self.loop._cycle(stopping)
+    def cycle(self, stopping=False):
+        self.recorder._cycle(stopping)
+
+    def run_to_the_end(self):
+        self.recorder._stopping = True
+        self.recorder._run()
+
+
+@pytest.fixture
+def stage_of(tmp_path, monkeypatch):
+    return lambda **given: Stage(tmp_path, monkeypatch, **given)
 
 
 # --- the loop -------------------------------------------------------------------------------
 
 
-def test_each_step_of_a_cycle_is_given_a_time_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_step_of_a_cycle_is_given_a_time_of_its_own(stage_of):
     """However long the steps before it took, no step begins with their time on its account."""
-    stage = Stage(tmp_path, monkeypatch, STEP_S, sync_period_s=1.0, rotate_s=0.0)
-    begun: list[tuple[float, float]] = []
+    stage = stage_of(takes_s=STEP_S, sync_period_s=1.0, rotate_s=0.0)
+    begun = []
     stage.writer.before = lambda: begun.append(
         (stage.counters.status().stalled_s, stage.clock.now)
     )
@@ -182,13 +124,11 @@ def test_each_step_of_a_cycle_is_given_a_time_of_its_own(
     assert stage.counters.status().stalled_s == STEP_S
 
 
-def test_a_leftover_may_take_as_long_as_it_is_large(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, monkeypatch)
-    seen: list[float] = []
+def test_a_leftover_may_take_as_long_as_it_is_large(stage_of, monkeypatch):
+    stage = stage_of()
+    seen = []
 
-    def slow(_folder: Path) -> tuple[str, ...]:
+    def slow(_folder):
         stage.clock.now += 3600.0
         seen.append(stage.counters.status().stalled_s)
         return ('report',)
@@ -206,9 +146,9 @@ def test_a_leftover_may_take_as_long_as_it_is_large(
 
 @pytest.mark.parametrize(('first', 'longest'), [(1.0, 10.0), (0.5, 0.5), (2.0, 1000.0)])
 def test_each_failure_doubles_the_wait_up_to_the_longest_and_success_forgets_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: float, longest: float
-) -> None:
-    stage = Stage(tmp_path, monkeypatch, retry_s=first, retry_max_s=longest)
+    stage_of, first, longest
+):
+    stage = stage_of(retry_s=first, retry_max_s=longest)
     expected = [min(first * 2**k, longest) for k in range(6)]
     for _ in range(2):
         stage.writer.bad = {'flush'}
@@ -230,10 +170,8 @@ def test_each_failure_doubles_the_wait_up_to_the_longest_and_success_forgets_it(
         assert len(stage.writer.at('flush')) == before + 9
 
 
-def test_the_last_cycle_waits_for_no_retry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, monkeypatch)
+def test_the_last_cycle_waits_for_no_retry(stage_of):
+    stage = stage_of()
     stage.writer.bad = {'flush'}
     stage.cycle()
     stage.put()
@@ -245,18 +183,16 @@ def test_the_last_cycle_waits_for_no_retry(
 
 
 @given(
-    st.lists(st.sampled_from([0.0, 0.5, 1.0, 3.0]), max_size=40),
-    st.sampled_from([0.0, 1.0, 2.5]),
-    st.floats(1.0, 5.0),
+    st.lists(st.sampled_from([0.0, 0.5, 1.0, 3.0]), max_size=40), st.sampled_from([0.0, 1.0, 2.5])
 )
 @settings(max_examples=40)
 def test_the_disk_is_asked_as_often_as_the_period_says_and_never_without_one(
-    waits: list[float], period: float, takes: float
-) -> None:
+    tmp_path_factory, waits, period
+):
     """The slow truth asks at each cycle whether the last time is a period ago."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        stage = Stage(Path('/nowhere'), monkeypatch, sync_period_s=period)
-        monkeypatch.setattr(recorder, 'recover_leftovers', lambda _: ())
+        folder = tmp_path_factory.mktemp('log')
+        stage = Stage(folder, monkeypatch, sync_period_s=period)
         last, expected = 0.0, []
         for wait in waits:
             if period > 0 and stage.clock.now - last >= period:
@@ -267,68 +203,58 @@ def test_the_disk_is_asked_as_often_as_the_period_says_and_never_without_one(
         assert stage.writer.at('sync') == expected
 
 
-def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, monkeypatch, rotate_s=0.0, keep_files=1)
+def test_a_file_that_somebody_else_removed_first_is_as_good_as_removed(stage_of):
+    stage = stage_of(rotate_s=0.0, keep_files=1)
     stage.put()
     stage.cycle()
-    (tmp_path / 'log_0.mcap').unlink()
+    (stage.folder / 'log_0.mcap').unlink()
     stage.put()
     stage.cycle()
     assert stage.counters.status().reason == ''
     assert [s.name for s in stage.writer.finished] == ['log_1.mcap']
 
 
-def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, monkeypatch)
-    stage.loop.put(NewTopic('/curve', FLOAT64, (Qos(),), 'hash', 'float64 data', True))
+def test_a_latched_message_is_a_repetition_only_once_it_is_on_disk(stage_of):
+    stage = stage_of()
+    stage.recorder.add_topic('/curve', 'x/msg/X', definition='float64 data', latched=True)
     stage.put(2)
     stage.put(2, '/curve')
     stage.writer.bad = {'flush'}
     stage.cycle()
-    assert stage.loop.latched() == []
+    assert not stage.recorder._latched
     stage.writer.bad = set()
     stage.clock.now += 1.0
     stage.cycle()
-    assert [m.topic for m in stage.loop.latched()] == ['/curve']
-    topic, _, more = stage.writer.took[0]
-    assert (topic, more['type_hash'], more['definition']) == ('/curve', 'hash', 'float64 data')
-    assert more['qos'] == (Qos(),)
+    assert list(stage.recorder._latched) == ['/curve']
+    assert open_log(stage.folder).topics['/curve'].definition == 'float64 data'
 
 
 @pytest.mark.parametrize('bad', ['', 'note', 'close'])
-def test_at_the_end_the_account_stands_in_the_file_and_a_failure_lets_go_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: str
-) -> None:
-    stage = Stage(tmp_path, monkeypatch)
+def test_at_the_end_the_account_stands_in_the_file_and_a_failure_lets_go_of_it(stage_of, bad):
+    stage = stage_of()
     stage.put(3)
-    stage.loop._stopping = True
     stage.writer.bad = {bad}
-    stage.loop._run()
+    stage.run_to_the_end()
     status = stage.counters.status()
     assert status.state == RecorderState.STOPPED
     assert status.reason == (f'log: {bad} failed.' if bad else '')
     assert (status.written, status.lost, status.file) == (3, 0, '')
     assert bool(stage.writer.at('abandon')) == bool(bad)
-    assert (status.files_finished, status.bytes_written) == ((0, 100) if bad else (1, 100))
+    assert status.files_finished == (0 if bad else 1)
+    (file,) = stage.folder.glob('log_0.mcap*')
+    assert bad or status.bytes_written == file.stat().st_size
     if bad != 'note':
-        assert stage.writer.noted == {'valveflow_recorder': {'received': '3'}}
+        assert open_log(file).metadata['valveflow_recorder'] == {'received': '3'}
 
 
-def test_what_never_began_says_that_nothing_could_be_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(_folder: Path) -> tuple[()]:
+def test_what_never_began_says_that_nothing_could_be_recorded(stage_of, monkeypatch):
+    def broken(_folder):
         raise RecordingError('log', 'cannot be read')
 
     monkeypatch.setattr(recorder, 'recover_leftovers', broken)
-    stage = Stage(tmp_path, monkeypatch)
+    stage = stage_of()
     stage.put()
-    stage.loop._stopping = True
-    stage.loop._run()
+    stage.run_to_the_end()
     status = stage.counters.status()
     assert (status.reason, status.lost) == ('nothing could be recorded', 1)
     assert status.stalled_s == 0.0
@@ -336,6 +262,8 @@ def test_what_never_began_says_that_nothing_could_be_recorded(
 
 # --- the account ----------------------------------------------------------------------------
 
+NOTHING = dict.fromkeys(('lost', 'removed', 'files_finished', 'bytes_finished', 'file_bytes'), 0)
+NOTHING |= {'loss': '', 'path': None}
 acts = st.lists(
     st.one_of(
         st.tuples(st.just('admit'), st.sampled_from(['/a', '/b'])),
@@ -349,13 +277,11 @@ acts = st.lists(
 
 @given(acts, st.integers(0, 6))
 @settings(max_examples=60)
-def test_every_message_is_in_exactly_one_column_whatever_happens(
-    story: list[tuple[Any, ...]], limit: int
-) -> None:
+def test_every_message_is_in_exactly_one_column_whatever_happens(story, limit):
     """The slow truth keeps every message as one entry of a list."""
     clock = Clock()
     counters = RecorderCounters(limit, clock=clock.monotonic)
-    messages: list[str] = []
+    messages = []
     open_, since, dropped_at, state = True, None, -1e9, ('recording', '')
     for act, *more in story:
         queued = [k for k, where in enumerate(messages) if where == 'queued']
@@ -368,9 +294,8 @@ def test_every_message_is_in_exactly_one_column_whatever_happens(
         elif act == 'write':
             for k in queued[: more[0]]:
                 messages[k] = 'written'
-            writer = Writer(clock, Path())
-            writer.written = messages.count('written')
-            counters.on_disk(writer)
+            written = messages.count('written')
+            counters.on_disk(SimpleNamespace(**NOTHING | {'written': written}))
         elif act == 'well':
             counters.healthy()
             lately = clock.now - dropped_at < DROPS_SHOWN_S
@@ -405,68 +330,3 @@ def test_every_message_is_in_exactly_one_column_whatever_happens(
     told = counters.as_metadata()
     assert told.pop('received') == str(len(messages))
     assert told == {f'dropped {t}': str(n) for t, n in counters.status().dropped.items()}
-
-
-# --- chunks ---------------------------------------------------------------------------------
-
-times_ns = st.integers(0, 2**63 - 1)
-rows = st.lists(
-    st.tuples(
-        st.integers(0, 65535), st.integers(0, 2**34), times_ns, times_ns, st.binary(max_size=40)
-    ),
-    max_size=20,
-)
-
-
-@pytest.mark.parametrize('size', [1, 1000, 70_000])
-def test_a_chunk_is_closed_by_the_message_that_fills_64_kib(tmp_path: Path, size: int) -> None:
-    """So much and no more is lost with a chunk, and so much is compressed at once."""
-    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
-        writer.add_topic('/a', FLOAT64)
-        for k in range(250_000 // (31 + size)):
-            writer.write('/a', bytes(size), START_NS + k, START_NS + k)
-    raw = (tmp_path / 'log' / 'log_0.mcap').read_bytes()
-    heads = [begin for op, begin, _ in records(raw) if op == Opcode.CHUNK]
-    sizes = [struct.unpack_from('<Q', raw, begin + 9 + 16)[0] for begin in heads]
-    assert len(sizes) > 2
-    # The tables of topics stand in some of them, too; they are small.
-    assert all(65536 <= n < 65536 + 31 + size + 2000 for n in sizes[:-1])
-
-
-# --- the whole ------------------------------------------------------------------------------
-
-
-def test_only_what_was_asked_for_is_repeated_and_a_hash_is_made_where_none_is_given(
-    tmp_path: Path,
-) -> None:
-    quick = RecorderSettings(flush_period_s=0.002, free_floor_bytes=0)
-    folder = tmp_path / 'deep' / 'log'
-    recorder = Recorder(folder, quick, definitions=STOCK, name='mine', metadata={'m': {'a': 'b'}})
-    recorder.add_topic('/a', FLOAT64)
-    recorder.add_topic('/own', 'x_msgs/msg/Own', definition='float64 data\n')
-    # Again changes nothing, whatever else is said.
-    other = {'definition': 'nonsense[', 'latched': True, 'type_hash': 'RIHS01_' + '0' * 64}
-    recorder.add_topic('/own', 'x_msgs/msg/Own', **other)
-    for part in range(2):
-        for topic in ('/a', '/own'):
-            assert recorder.record(topic, float64(part), START_NS + part, START_NS) is True
-        recorder.rotate()
-        end_s = time.monotonic() + 20.0
-        while recorder.is_rotating and time.monotonic() < end_s:
-            time.sleep(0.001)
-    status = recorder.close(20.0)
-    assert (status.state, status.written) == (RecorderState.STOPPED, 4)
-    assert recorder.record('/a', float64(0), START_NS, START_NS) is False
-    found = open_log(folder)
-    assert [m.topic for m in found.iter_messages()] == ['/a', '/own'] * 2
-    # The second split alone: nothing of the first stands at its head.
-    second = list(open_log(folder / 'mine_1.mcap').iter_messages())
-    assert [(m.topic, m.data) for m in second] == [(t, float64(1)) for t in ('/a', '/own')]
-    assert all(info.type_hash.startswith('RIHS01_') for info in found.topics.values())
-    assert found.topics['/a'].type_hash != found.topics['/own'].type_hash
-    assert found.topics['/own'].definition == 'float64 data\n'
-    assert '0' * 64 not in found.topics['/own'].type_hash
-    assert found.metadata['m'] == {'a': 'b'}
-    assert all(p.name.startswith('mine_') for p in folder.glob('*.mcap'))
-    assert folder.stat().st_mode & 0o777 == 0o700
-    assert recorder.folder == folder

@@ -16,15 +16,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_files import wander
+from table_files import HEAD, ROWS, csv, ns, timed, workbook
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.logs import open_log, read_table, write_table
 from valveflow_ros.logs.tables import file
+from valveflow_ros.logs.tables.cells import foreign_quality
 from valveflow_ros.logs.tables.refusal import TableOptions
-from valveflow_ros.records import SIGNALS, Signal
+from valveflow_ros.records import SIGNALS, Quality, Signal
 
-START = dt.datetime(2026, 11, 22, 14, 5, 0)
 N = 40
+STAMPS = [dt.datetime(2026, 11, 22, 14, 5) + dt.timedelta(seconds=10 * k) for k in range(N)]
 # As a plant would write them, in %, MPa, degC and MW.
 VALUES = {
     Signal.VALVE_OPENING: np.round(60 + 20 * np.sin(np.arange(N) / 5), 2),
@@ -41,24 +43,13 @@ NAMES = {
     'short': ('Zeit', 'HD Ventilhub', 'p_FD', 'T_FD', 'Leistung'),
 }  # fmt: skip
 UNITS = ('%', 'MPa', 'degC', 'MW')
-DATES = {
-    'iso': '%Y-%m-%d %H:%M:%S',
-    'iso_t': '%Y-%m-%dT%H:%M:%SZ',
-    'dots': '%d.%m.%Y %H:%M:%S',
-    'us': '%m/%d/%Y %I:%M:%S %p',
-    'slashes': '%Y/%m/%d %H:%M:%S',
-    'pi': '%d-%b-%y %H:%M:%S',
-    'short': '%d.%m.%y %H:%M:%S',
-}
-
-
-def stamps(step_s=10):
-    return [START + dt.timedelta(seconds=step_s * k) for k in range(N)]
-
-
-def expected_ns(step_s=10):
-    first = int(START.replace(tzinfo=dt.timezone.utc).timestamp())
-    return (first + step_s * np.arange(N)) * 10**9
+DATES = (
+    '%Y-%m-%d %H:%M:%S', '%Y-%m-%dT%H:%M:%SZ', '%d.%m.%Y %H:%M:%S', '%m/%d/%Y %I:%M:%S %p',
+    '%Y/%m/%d %H:%M:%S', '%d-%b-%y %H:%M:%S', '%d.%m.%y %H:%M:%S',
+)  # fmt: skip
+# Separator, decimal and thousands mark.
+STYLES = ((',', '.', ''), (';', ',', ''), ('\t', ',', ''), ('\t', '.', ''), (',', '.', ','),
+          (';', ',', '.'), ('|', '.', ''), (';', '.', ''))  # fmt: skip
 
 
 def cell(value, decimal, thousands=''):
@@ -66,8 +57,9 @@ def cell(value, decimal, thousands=''):
     return f'"{text}"' if ',' in text and thousands == ',' else text
 
 
-def write(path, *, names='english', units='header', date='iso', separator=',', decimal='.',
-          thousands='', encoding='utf-8', preamble=0, reverse=False):  # fmt: skip
+def write(path, names='english', units='header', date=DATES[0], style=STYLES[0], encoding='utf-8',
+          preamble=0, reverse=False):  # fmt: skip
+    separator, *marks = style
     head = list(NAMES[names])
     if units == 'header':
         head[1:] = [f'{name} [{unit}]' for name, unit in zip(head[1:], UNITS, strict=True)]
@@ -75,83 +67,62 @@ def write(path, *, names='english', units='header', date='iso', separator=',', d
     if units == 'row':
         lines.append(separator.join(['', *UNITS]))
     rows = [
-        separator.join([t.strftime(DATES[date]),
-                        *(cell(v[k], decimal, thousands) for v in VALUES.values())])
-        for k, t in enumerate(stamps())
-    ]  # fmt: skip
+        separator.join([t.strftime(date), *(cell(v[k], *marks) for v in VALUES.values())])
+        for k, t in enumerate(STAMPS)
+    ]
     text = '\r\n'.join([*lines, *(reversed(rows) if reverse else rows)]) + '\r\n'
     path.write_bytes(text.encode(encoding))
     return path
 
 
 def check(raw):
-    assert raw.time_ns.tolist() == expected_ns().tolist()
+    assert raw.time_ns.tolist() == ns(STAMPS)
     for info in SIGNALS[:4]:
         assert np.allclose(raw.columns[info.column], VALUES[info.signal], rtol=0, atol=6e-4)
-    assert not raw.bad_cells
-    assert raw.bad_times == 0
+    assert (raw.bad_cells, raw.bad_times) == ({}, 0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
-    names=st.sampled_from(list(NAMES)),
-    units=st.sampled_from(['header', 'row', 'none']),
-    date=st.sampled_from(list(DATES)),
-    style=st.sampled_from([(',', '.', ''), (';', ',', ''), ('\t', ',', ''), ('\t', '.', ''),
-                           (',', '.', ','), (';', ',', '.'), ('|', '.', ''), (';', '.', '')]),
-    encoding=st.sampled_from(['utf-8', 'utf-8-sig', 'utf-16', 'cp1252']),
-    preamble=st.integers(0, 3),
-    reverse=st.booleans(),
-)  # fmt: skip
-def test_any_dialect_gives_the_same_values(tmp_path_factory, names, units, date, style, encoding,
-                                           preamble, reverse):  # fmt: skip
-    separator, decimal, thousands = style
-    path = write(
-        tmp_path_factory.mktemp('t') / 'x.csv', names=names, units=units, date=date,
-        separator=separator, decimal=decimal, thousands=thousands, encoding=encoding,
-        preamble=preamble, reverse=reverse,
-    )  # fmt: skip
-    check(read_table(path))
+    st.tuples(
+        st.sampled_from(list(NAMES)),
+        st.sampled_from(['header', 'row', 'none']),
+        st.sampled_from(DATES),
+        st.sampled_from(STYLES),
+        st.sampled_from(['utf-8', 'utf-8-sig', 'utf-16', 'cp1252']),
+        st.integers(0, 3),
+        st.booleans(),
+    )
+)
+def test_any_dialect_gives_the_same_values(tmp_path_factory, dialect):
+    check(read_table(write(tmp_path_factory.mktemp('t') / 'x.csv', *dialect)))
 
 
 @pytest.mark.parametrize('block', [1, 7, 39, 40, 41])
 def test_the_size_of_the_blocks_changes_nothing(tmp_path, monkeypatch, block):
-    path = write(tmp_path / 'x.csv', names='german', separator=';', decimal=',', date='dots')
+    path = write(tmp_path / 'x.csv', 'german', date=DATES[2], style=STYLES[1])
     path.write_text(path.read_text().replace('538,', 'Bad', 3))
     whole = read_table(path)
     monkeypatch.setattr(file, 'BLOCK_ROWS', block)
     parts = read_table(path)
-    assert parts.notes == whole.notes
-    assert parts.bad_cells == whole.bad_cells
+    assert (parts.notes, parts.bad_cells) == (whole.notes, whole.bad_cells)
     assert np.array_equal(parts.time_ns, whole.time_ns)
     for name, column in whole.columns.items():
         assert np.array_equal(column, parts.columns[name], equal_nan=True)
 
 
 def test_a_workbook_and_a_parquet_file_give_the_same_values(tmp_path):
-    openpyxl = pytest.importorskip('openpyxl')
     pytest.importorskip('pyarrow')
-    pytest.importorskip('python_calamine')
-    book = openpyxl.Workbook()
-    sheet = book.active
-    sheet.append(['Export of unit 3'])
-    sheet.append([])
-    sheet.append(list(NAMES['german']))
-    sheet.append([None, *UNITS])
-    columns = [v.tolist() for v in VALUES.values()]
-    for time, *row in zip(stamps(), *columns, strict=True):
-        sheet.append([time, *row])
-    book.save(tmp_path / 'x.xlsx')
-    check(read_table(tmp_path / 'x.xlsx'))
-    book.create_sheet('Other').append([1, 2])
-    book['Other'].append([3, 4])
-    book.save(tmp_path / 'two.xlsx')
-    with pytest.raises(InputError, match=r"'Sheet' and 'Other'; choose with --sheet Sheet"):
-        read_table(tmp_path / 'two.xlsx')
-    check(read_table(tmp_path / 'two.xlsx', options=TableOptions(sheet='Sheet')))
+    columns = [STAMPS, *(v.tolist() for v in VALUES.values())]
+    rows = [['Export of unit 3'], [], NAMES['german'], [None, *UNITS], *zip(*columns, strict=True)]
+    check(read_table(workbook(tmp_path / 'x.xlsx', rows)))
+    two = workbook(tmp_path / 'two.xlsx', rows, [[1, 2], [3, 4]])
+    with pytest.raises(InputError, match=r"'Sheet' and 'Sheet1'; choose with --sheet Sheet"):
+        read_table(two)
+    check(read_table(two, options=TableOptions(sheet='Sheet')))
     with pytest.raises(InputError, match="no sheet 'None'"):
-        read_table(tmp_path / 'two.xlsx', options=TableOptions(sheet='None'))
-    frame = pd.DataFrame(dict(zip(NAMES['english'], [stamps(), *columns], strict=True)))
+        read_table(two, options=TableOptions(sheet='None'))
+    frame = pd.DataFrame(dict(zip(NAMES['english'], columns, strict=True)))
     frame.to_parquet(tmp_path / 'x.parquet')
     check(read_table(tmp_path / 'x.parquet'))
 
@@ -159,23 +130,17 @@ def test_a_workbook_and_a_parquet_file_give_the_same_values(tmp_path):
 def test_without_the_library_of_a_format_it_says_what_to_install(tmp_path, monkeypatch):
     for library in ('python_calamine', 'pyarrow'):
         monkeypatch.setitem(sys.modules, library, None)
-    (tmp_path / 'x.xlsx').write_bytes(b'PK\x03\x04')
-    (tmp_path / 'x.parquet').write_bytes(b'PAR1')
-    with pytest.raises(RecordingError, match='pip install python-calamine'):
-        read_table(tmp_path / 'x.xlsx')
-    with pytest.raises(RecordingError, match='pip install pyarrow'):
-        read_table(tmp_path / 'x.parquet')
+    for name, library in (('x.xlsx', 'python-calamine'), ('x.parquet', 'pyarrow')):
+        (tmp_path / name).write_bytes(b'PK\x03\x04' if name == 'x.xlsx' else b'PAR1')
+        with pytest.raises(RecordingError, match=f'pip install {library}'):
+            read_table(tmp_path / name)
     with pytest.raises(RecordingError, match='pip install pyarrow'):
         write_table(wander(9, seed=1), tmp_path / 'y.parquet')
     assert not (tmp_path / 'y.parquet').exists()
-
-
-def test_a_pyarrow_that_refuses_this_numpy_is_told(tmp_path, monkeypatch):
-    """As 26 does beside the NumPy 1.26 of Ubuntu 24.04."""
+    # As 26 does beside the NumPy 1.26 of Ubuntu 24.04.
     (tmp_path / 'pyarrow.py').write_text('raise ImportError("pyarrow requires NumPy 2.0")\n')
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, 'pyarrow', raising=False)
-    (tmp_path / 'x.parquet').write_bytes(b'PAR1')
+    monkeypatch.delitem(sys.modules, 'pyarrow')
     with pytest.raises(RecordingError, match=r'requires NumPy 2\.0.*pip install "pyarrow<26"'):
         read_table(tmp_path / 'x.parquet')
 
@@ -202,14 +167,14 @@ def test_csv_needs_neither_library(tmp_path):
 def test_a_row_for_each_value(tmp_path):
     tags = ('U3:CV_POS', 'U3:PT100', 'U3:TT100', 'U3:JT1')
     abouts = ('HP valve position', 'Main steam pressure', 'Main steam temperature', 'Active power')
-    lines = ['Tag,Time,Value,Unit,Description,Quality']
+    lines = []
     for tag, unit, about, values in zip(tags, UNITS, abouts, VALUES.values(), strict=True):
-        for k, time in enumerate(stamps()):
+        for k, time in enumerate(STAMPS):
             text = 'No Data' if (tag, k) == ('U3:JT1', 5) else f'{values[k]:.3f}'
             mark = 'Bad' if (tag, k) == ('U3:PT100', 6) else 'Good'
             lines.append(f'{tag},{time:%d-%b-%y %H:%M:%S},{text},{unit},{about},{mark}')
-    path = tmp_path / 'pi.csv'
-    path.write_text('\n'.join([*lines, 'U3:SPARE,22-Nov-26 14:05:00,1,,,Good']) + '\n')
+    lines.append('U3:SPARE,22-Nov-26 14:05:00,1,,,Good')
+    path = csv(tmp_path, lines, 'Tag,Time,Value,Unit,Description,Quality')
     raw = read_table(path)
     assert raw.ignored == ('U3:SPARE',)
     assert raw.bad_cells == {'generated_power_mw': 1}
@@ -218,36 +183,34 @@ def test_a_row_for_each_value(tmp_path):
     assert (np.diff(readings.time_ns) >= 0).all()
     for signal, values in VALUES.items():
         mine = readings.signal == signal
-        assert readings.time_ns[mine].tolist() == expected_ns().tolist()
+        assert readings.time_ns[mine].tolist() == ns(STAMPS)
         found, good = readings.value[mine], np.ones(N, bool)
         good[[k for s, k in ((3, 5), (1, 6)) if s == signal]] = False
         assert np.allclose(found[good], values[good], rtol=0, atol=6e-4)
         assert np.isnan(found[~good]).all()
 
 
+# Dates -----------------------------------------------------------------------------------------
+
+
+def times_in(folder, rows, head=HEAD, **options):
+    return read_table(csv(folder, rows, head), options=TableOptions(**options)).time_ns.tolist()
+
+
 def test_day_and_month_are_told_apart_or_asked_for(tmp_path):
-    lines = [f'{day:02}/03/2026 12:00,50,13,538,600' for day in (1, 2, 3)]
-    path = tmp_path / 'x.csv'
-    path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *lines]))
+    rows = timed(*(f'{day:02}/03/2026 12:00' for day in (1, 2, 3)))
     with pytest.raises(InputError, match=r'--date-order dmy .* --date-order mdy'):
-        read_table(path)
-    by_day = read_table(path, options=TableOptions(date_order='dmy')).time_ns
-    assert np.diff(by_day).tolist() == [86400 * 10**9] * 2
-    by_month = read_table(path, options=TableOptions(date_order='mdy')).time_ns
-    assert np.diff(by_month).tolist() == [31 * 86400 * 10**9, 28 * 86400 * 10**9]
-    path.write_text(path.read_text() + '\n13/03/2026 12:00,50,13,538,600\n')
-    assert read_table(path).time_ns[:3].tolist() == by_day.tolist()
+        times_in(tmp_path, rows)
+    by_day = ns(['2026-03-01 12:00', '2026-03-02 12:00', '2026-03-03 12:00'])
+    assert times_in(tmp_path, rows, date_order='dmy') == by_day
+    by_month = ns(['2026-01-03 12:00', '2026-02-03 12:00', '2026-03-03 12:00'])
+    assert times_in(tmp_path, rows, date_order='mdy') == by_month
+    assert times_in(tmp_path, [*rows, *timed('13/03/2026 12:00')])[:3] == by_day
 
 
 def test_only_the_end_of_a_long_file_tells_day_from_month(tmp_path):
     times = pd.date_range('2026-03-01', '2026-03-20', freq='1min')
-    lines = [f'{t:%d/%m/%Y %H:%M:%S},50,13,538,600' for t in times]
-    path = tmp_path / 'x.csv'
-    path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *lines]))
-    assert (
-        read_table(path).time_ns.tolist()
-        == times.astype('datetime64[ns]').astype('int64').tolist()
-    )
+    assert times_in(tmp_path, timed(*times.strftime('%d/%m/%Y %H:%M:%S'))) == ns(times)
 
 
 @pytest.mark.parametrize('newest_first', [False, True])
@@ -255,16 +218,13 @@ def test_only_the_end_of_a_long_file_tells_day_from_month(tmp_path):
 @pytest.mark.parametrize('zone', ['Europe/Berlin', 'America/New_York'])
 def test_the_hour_that_comes_twice(tmp_path, monkeypatch, zone, block, newest_first):
     place = zoneinfo.ZoneInfo(zone)
-    day = dt.datetime(2026, 10, 25) if zone == 'Europe/Berlin' else dt.datetime(2026, 11, 1)
-    start = day.replace(tzinfo=dt.timezone.utc) - dt.timedelta(hours=2)
-    truth = [start + dt.timedelta(minutes=k) for k in range(12 * 60)]
-    lines = [f'{t.astimezone(place):%d.%m.%Y %H:%M:%S},50,13,538,600' for t in truth]
-    path = tmp_path / 'x.csv'
-    ordered = reversed(lines) if newest_first else lines
-    path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *ordered]))
+    day = '2026-10-24 22:00' if zone == 'Europe/Berlin' else '2026-10-31 22:00'
+    truth = pd.date_range(day, periods=12 * 60, freq='1min', tz='UTC')
+    rows = timed(*truth.tz_convert(place).strftime('%d.%m.%Y %H:%M:%S'))
+    path = csv(tmp_path, rows[::-1] if newest_first else rows)
     monkeypatch.setattr(file, 'BLOCK_ROWS', block)
     raw = read_table(path, options=TableOptions(time_zone=zone))
-    assert raw.time_ns.tolist() == [int(t.timestamp()) * 10**9 for t in truth]
+    assert raw.time_ns.tolist() == ns(truth.tz_localize(None))
     assert any('120 rows stand in the hour that comes twice' in note for note in raw.notes)
     if not newest_first:
         with pytest.raises(InputError, match=r'go back by an hour .* --time-zone'):
@@ -274,14 +234,11 @@ def test_the_hour_that_comes_twice(tmp_path, monkeypatch, zone, block, newest_fi
 
 def test_a_clock_that_is_not_set_forward_is_told(tmp_path):
     times = pd.date_range('2026-03-29 00:00', periods=300, freq='1min')
-    lines = [f'{t:%Y-%m-%d %H:%M:%S},50,13,538,600' for t in times]
-    path = tmp_path / 'x.csv'
-    path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *lines]))
+    rows = timed(*times.strftime('%Y-%m-%d %H:%M:%S'))
     with pytest.raises(InputError, match=r'does not exist in Europe/Berlin.* --time-zone \+01:00'):
-        read_table(path, options=TableOptions(time_zone='Europe/Berlin'))
-    raw = read_table(path, options=TableOptions(time_zone='+01:00'))
-    hour_before = times.astype('datetime64[ns]').astype('int64') - 3600 * 10**9
-    assert raw.time_ns.tolist() == hour_before.tolist()
+        times_in(tmp_path, rows, time_zone='Europe/Berlin')
+    found = times_in(tmp_path, rows, time_zone='+01:00')
+    assert found == ns(times - pd.Timedelta(hours=1))
 
 
 @pytest.mark.parametrize(
@@ -289,60 +246,111 @@ def test_a_clock_that_is_not_set_forward_is_told(tmp_path):
     [
         ('Time (UTC)', 0),
         ('Zeit [Europe/Berlin]', 1),
+        ('Time (Europe/Berlin)', 1),
         ('Timestamp +02:00', 2),
         ('Zeit [MEZ]', None),
+        # Date and time parted by a slash are no zone.
+        ('Sample Date/Time', 0),
+        ('PI Date/Time', 0),
+        ('Date/Time', 0),
     ],
 )
 def test_the_zone_may_stand_in_the_header(tmp_path, name, offset_h):
-    path = tmp_path / 'x.csv'
-    path.write_text(f'{name},valve position,ms pressure,ms temperature,MW\n'
-                    '2026-01-05 12:00:00,50,13,538,600\n')  # fmt: skip
+    rows, head = timed('2026-01-05 12:00:00'), HEAD.replace('time', name, 1)
     if offset_h is None:
         with pytest.raises(InputError, match=r'MEZ does not say .* --time-zone'):
-            read_table(path)
+            times_in(tmp_path, rows, head)
         return
-    noon = int(pd.Timestamp('2026-01-05 12:00').value)
-    assert read_table(path).time_ns.tolist() == [noon - offset_h * 3600 * 10**9]
+    assert times_in(tmp_path, rows, head) == ns([f'2026-01-05 {12 - offset_h}:00'])
 
 
 @pytest.mark.parametrize('day', ['2026-10-25', '25.10.2026', '25-Oct-26'])
 def test_german_times_tell_summer_from_winter_themselves(tmp_path, day):
     clocks = ('02:30:00 MESZ', '02:30:00 MEZ', '03:30:00 CET', '03:31:00+01:00', '02:32:00Z')
-    lines = [f'{day} {clock},50,13,538,600' for clock in clocks]
-    path = tmp_path / 'x.csv'
-    path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *lines]))
-    first = pd.Timestamp('2026-10-25 00:30').value
-    minutes = (np.array(read_table(path).time_ns) - first) // (60 * 10**9)
-    assert minutes.tolist() == [0, 60, 120, 121, 122]
+    found = times_in(tmp_path, timed(*(f'{day} {clock}' for clock in clocks)))
+    assert found == ns([f'2026-10-25 {t}' for t in ('00:30', '01:30', '02:30', '02:31', '02:32')])
+
+
+@pytest.mark.parametrize('date', ['%Y-%m-%d %H:%M:%S', '%Y-%m-%dT%H:%M', '%d.%m.%Y %H:%M:%S'])
+@pytest.mark.parametrize(('offset', 'hours'), [('+01', 1), ('-05', -5), ('+0530', 5.5)])
+def test_an_offset_of_whole_hours_is_one(tmp_path, date, offset, hours):
+    days = pd.date_range('2026-01-05 12:00', periods=20, freq='h')
+    found = times_in(tmp_path, timed(*(days.strftime(date) + offset)))
+    assert found == ns(days - pd.Timedelta(hours=hours))
+
+
+@pytest.mark.parametrize('date', ['%Y-%m-%d', '%d-%m-%Y', '%Y-%m-%d %H:%M'])
+def test_the_end_of_a_date_is_no_offset(tmp_path, date):
+    days = pd.date_range('2026-01-05', periods=20, freq='D')
+    assert times_in(tmp_path, timed(*days.strftime(date))) == ns(days)
 
 
 def test_days_of_a_workbook_in_a_text(tmp_path):
-    days = [(t - dt.datetime(1899, 12, 30)).total_seconds() / 86400 for t in stamps()]
-    lines = [f'{d!r},50,13,538,600' for d in days]
-    path = tmp_path / 'x.csv'
-    path.write_text('\n'.join(['time,valve position,ms pressure,ms temperature,MW', *lines]))
-    assert read_table(path).time_ns.tolist() == expected_ns().tolist()
+    days = [(t - dt.datetime(1899, 12, 30)).total_seconds() / 86400 for t in STAMPS]
+    assert times_in(tmp_path, timed(*days)) == ns(STAMPS)
+
+
+# Numbers and qualities -------------------------------------------------------------------------
 
 
 def test_a_comma_that_may_be_either_is_asked_for(tmp_path):
     rows = [f'2026-01-05 12:00:0{k}\t50\t13\t538\t230,14{k}' for k in range(5)]
-    path = tmp_path / 'x.csv'
-    path.write_text('\n'.join(['time\tvalve position\tms pressure\tms temperature\tMW', *rows]))
+    path = csv(tmp_path, rows, HEAD.replace(',', '\t'))
     with pytest.raises(InputError, match=r'--decimal comma .* --decimal point'):
         read_table(path)
-    power = read_table(path, options=TableOptions(decimal='comma')).columns['generated_power_mw']
-    assert power.tolist() == [230.14, 230.141, 230.142, 230.143, 230.144]
-    power = read_table(path, options=TableOptions(decimal='point')).columns['generated_power_mw']
-    assert power.tolist() == [230140, 230141, 230142, 230143, 230144]
+    for mark, expected in (('comma', [230.14, 230.141, 230.142, 230.143, 230.144]),
+                           ('point', [230140, 230141, 230142, 230143, 230144])):  # fmt: skip
+        raw = read_table(path, options=TableOptions(decimal=mark))
+        assert raw.columns['generated_power_mw'].tolist() == expected
 
 
 def test_quality_beside_a_column(tmp_path):
-    path = tmp_path / 'x.csv'
-    lines = ['Time,Valve position [%],Valve position Quality,MS pressure,MS pressure.Q,MS temp,MW']
-    for k, (word, code) in enumerate([('Good', 192), ('Questionable', 64), ('Bad', 24), ('', 0)]):
-        lines.append(f'2026-01-05 12:00:0{k},50,{word},13,{code},538,600')
-    path.write_text('\n'.join(lines))
-    raw = read_table(path)
+    head = 'Time,Valve position [%],Valve position Quality,MS pressure,MS pressure.Q,MS temp,MW'
+    marks = [('Good', 192), ('Questionable', 64), ('Bad', 24), ('', 0)]
+    rows = [
+        f'2026-01-05 12:00:0{k},50,{word},13,{code},538,600'
+        for k, (word, code) in enumerate(marks)
+    ]
+    raw = read_table(csv(tmp_path, rows, head))
     assert raw.quality['valve_opening_percent'].tolist() == [0, 1, 2, 2]
     assert raw.quality['main_steam_pressure_mpa'].tolist() == [0, 1, 2, 2]
     assert raw.ignored == ()
+
+
+def qualities(*texts):
+    return [Quality(code) for code in foreign_quality(pd.Series(list(texts)))]
+
+
+@given(st.permutations(['Raw', 'Good', 'Questionable', 'Bad']), st.integers(1, 4))
+def test_the_gravest_word_of_quality_counts(words, n):
+    alone = qualities(*words[:n])
+    assert qualities(', '.join(words[:n])) == [max(alone)]
+    assert qualities(' '.join(words[:n])) == [max(alone)]
+
+
+def test_what_is_not_good_is_bad():
+    bad = ('Not Good', 'No Good Data', 'nicht gut', 'NotGood', 'nicht mehr gültig', 'Raw, not ok')
+    assert qualities(*bad) == [Quality.BAD] * len(bad)
+    good = ('Good, no error', 'Good | not annotated', 'No alarm; Good', 'Good, Non-Specific')
+    assert qualities(*good) == [Quality.GOOD] * len(good)
+
+
+@pytest.mark.parametrize('long', [False, True])
+def test_the_column_of_quality_is_named_and_what_is_bad_by_it_counted(tmp_path, long):
+    mark = ['Raw, Bad' if k % 10 == 3 else 'Raw, Good' for k in range(20)]
+    if long:
+        head, rows = 'Tag,Time,Value,Quality', []
+        for place, tag in enumerate(('CV_POS', 'PT100', 'TT100', 'JT1'), 1):
+            cells = [row.split(',') for row in ROWS]
+            rows += [f'{tag},{c[0]},{c[place]},"{m if place == 4 else "Good"}"'
+                     for c, m in zip(cells, mark, strict=True)]  # fmt: skip
+        said = "'JT1' is read from 'Quality', by which 2 of its values are bad."
+    else:
+        head = f'{HEAD},MW Quality'
+        rows = [f'{row},"{m}"' for row, m in zip(ROWS, mark, strict=True)]
+        said = "'MW' is read from 'MW Quality', by which 2 of its values are bad."
+    path = csv(tmp_path, rows, head)
+    assert any(note.endswith(said) for note in read_table(path).notes)
+    readings = open_log(path).readings
+    power = readings.value[readings.signal == Signal.GENERATED_POWER]
+    assert np.flatnonzero(np.isnan(power)).tolist() == [3, 13]

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from log_files import (
@@ -20,13 +21,19 @@ from log_files import (
     float64,
     plant_sample,
     read_back,
+    records,
+    same_arrays,
+    stock,
+    wander,
     write_chunks,
     write_messages,
 )
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
 
-from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs import LATCHED, Message, RecordingWriter, open_log
+from valveflow_ros.errors import DataError, InputError, RecordingError
+from valveflow_ros.logs import Message, RecordingWriter, open_log, write_samples, write_table
+from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
 AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader
 DecoderFactory = pytest.importorskip('mcap_ros2.decoder').DecoderFactory
@@ -51,6 +58,18 @@ def by_mcap(path):
         ]
 
 
+def information(folder):
+    return yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+
+
+def names_in(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def modes_in(folder):
+    return {stat.S_IMODE(p.stat().st_mode) for p in folder.iterdir()}
+
+
 @pytest.fixture
 def samples(tmp_path):
     folder = tmp_path / 'samples'
@@ -63,40 +82,27 @@ def samples(tmp_path):
     return folder, rows
 
 
-def test_rosbags_reads_the_folder(tmp_path):
+def test_three_independent_readers_find_the_same(tmp_path):
     path, wanted, _ = write_chunks(tmp_path / 'log')
     found = by_rosbags(path.parent)
     assert [(t, m.data) for _, t, m in found] == [(w.log_time_ns, w.value) for w in wanted]
-    assert {topic for topic, _, _ in found} == {
-        '/unit1/valve_opening',
-        '/unit1/main_steam_pressure',
-        '/unit1/main_steam_temperature',
-        '/unit1/generated_power',
-    }
+    assert {topic for topic, _, _ in found} == {f'/unit1/{info.topic}' for info in SIGNALS[:4]}
+    expected = [(w.log_time_ns, w.time_ns, w.value) for w in wanted]
+    assert [(log, publish, m.data) for _, log, publish, m in by_mcap(path)] == expected
+    streamed = stock(path, seek=False)
+    assert [(m.log_ns, m.publish_ns) for m in streamed] == [row[:2] for row in expected]
 
 
-def test_mcap_and_its_decoder_read_the_file(tmp_path):
-    path, wanted, _ = write_chunks(tmp_path / 'log')
-    found = by_mcap(path)
-    assert [(log, publish, m.data) for _, log, publish, m in found] == [
-        (w.log_time_ns, w.time_ns, w.value) for w in wanted
-    ]
-
-
-def test_own_messages_are_read_by_both(samples):
+def test_own_messages_are_read_by_both_and_by_us(samples):
     folder, rows = samples
     for found in (by_rosbags(folder), by_mcap(folder / 'samples_0.mcap')):
         assert [m[-1].main_steam_pressure for m in found] == [v[1] for _, v in rows]
         assert [m[-1].generated_power for m in found] == [v[3] for _, v in rows]
         assert {m[-1].generated_power_quality for m in found} == {3}
         assert {m[-1].header.frame_id for m in found} == {'HV101'}
-
-
-def test_a_reader_of_streams_sees_valid_checksums_and_the_same_messages(tmp_path):
-    path, wanted, _ = write_chunks(tmp_path / 'log')
-    with path.open('rb') as stream:
-        messages = list(NonSeekingReader(stream, validate_crcs=True).iter_messages())
-    assert [m.log_time for _, _, m in messages] == [w.log_time_ns for w in wanted]
+    found = read_back(open_log(folder))
+    assert [r.time_ns for r in found] == [t for t, _ in rows for _ in range(5)]
+    assert [r.value for r in found] == [v for _, values in rows for v in values]
 
 
 def test_the_summary_is_right(tmp_path):
@@ -115,9 +121,8 @@ def test_the_summary_is_right(tmp_path):
     assert statistics.chunk_count == len(summary.chunk_indexes)
     assert {c.compression for c in summary.chunk_indexes} == {'zstd'}
     assert attachments == [('parameters.yaml', b'a: 1\n')]
-    assert yaml.safe_load(metadata['rosbag2']['serialized_metadata'])['message_count'] == len(
-        wanted
-    )
+    told = yaml.safe_load(metadata['rosbag2']['serialized_metadata'])
+    assert told['message_count'] == len(wanted)
     channel = next(iter(summary.channels.values()))
     assert channel.message_encoding == 'cdr'
     assert channel.metadata['topic_type_hash'] == STOCK.type_hash(FLOAT64)
@@ -127,9 +132,7 @@ def test_the_summary_is_right(tmp_path):
 
 def test_the_metadata_file_says_what_is_there(tmp_path):
     path, wanted, writer = write_chunks(tmp_path / 'log')
-    info = yaml.safe_load((path.parent / 'metadata.yaml').read_text())[
-        'rosbag2_bagfile_information'
-    ]
+    info = information(path.parent)
     assert (info['version'], info['storage_identifier']) == (9, 'mcap')
     assert info['message_count'] == writer.written == len(wanted)
     assert info['starting_time']['nanoseconds_since_epoch'] == wanted[0].log_time_ns
@@ -141,93 +144,59 @@ def test_the_metadata_file_says_what_is_there(tmp_path):
     assert isinstance(info['custom_data'], dict)
 
 
+@pytest.mark.parametrize('size', [1, 1000, 70_000])
+def test_a_chunk_is_closed_by_the_message_that_fills_64_kib(tmp_path, size):
+    """So much and no more is lost with a chunk, and so much is compressed at once."""
+    row = Message('/a', bytes(size), START_NS, START_NS)
+    raw = write_messages(tmp_path, {'/a': FLOAT64}, [row] * (250_000 // (31 + size))).read_bytes()
+    heads = [begin for op, begin, _ in records(raw) if op == Opcode.CHUNK]
+    sizes = [int.from_bytes(raw[begin + 25 : begin + 33], 'little') for begin in heads]
+    assert len(sizes) > 2
+    # The tables of topics stand in some of them, too; they are small.
+    assert all(65536 <= n < 65536 + 31 + size + 2000 for n in sizes[:-1])
+
+
 def test_only_the_owner_may_look(tmp_path):
     before = os.umask(0)
     try:
         path, _, _ = write_chunks(tmp_path / 'deep' / 'log')
     finally:
         os.umask(before)
-    assert {stat.S_IMODE(p.stat().st_mode) for p in path.parent.iterdir()} == {0o600}
-    folders = [path.parent, path.parent.parent]
-    assert {stat.S_IMODE(folder.stat().st_mode) for folder in folders} == {0o700}
-
-
-def test_an_unfinished_file_carries_another_name(tmp_path):
-    path, wanted, writer = write_chunks(tmp_path / 'log', close=False)
-    assert path.name == 'log_0.mcap.part'
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
-    assert len(open_log(path).readings) == len(wanted)
-    writer.close()
-    assert sorted(p.name for p in path.parent.iterdir()) == ['log_0.mcap', 'metadata.yaml']
+    assert modes_in(path.parent) == {0o600}
+    assert modes_in(path.parent.parent) | modes_in(tmp_path) == {0o700}
 
 
 def test_a_folder_is_continued(tmp_path):
-    folder = tmp_path / 'log'
-    _, first, _ = write_chunks(folder)
-    _, second, _ = write_chunks(folder)
-    assert sorted(p.name for p in folder.glob('*.mcap')) == ['log_0.mcap', 'log_1.mcap']
-    assert len(by_rosbags(folder)) == len(first) + len(second)
-    info = yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
-    assert info['message_count'] == len(first) + len(second)
+    (_, first, _), (_, second, _) = (write_chunks(tmp_path / 'log') for _ in range(2))
+    assert names_in(tmp_path / 'log') == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
+    assert len(by_rosbags(tmp_path / 'log')) == len(first) + len(second)
+    assert information(tmp_path / 'log')['message_count'] == len(first) + len(second)
 
 
-def test_splits_begin_with_the_latched_messages_which_are_read_once(tmp_path):
-    folder = tmp_path / 'log'
-    curve = Message('/curve', float64(7.0), START_NS, START_NS)
-    with RecordingWriter(folder, definitions=STOCK, head_messages=lambda: [curve]) as writer:
-        writer.add_topic('/curve', FLOAT64, qos=(LATCHED,))
-        writer.add_topic('/valve_opening', FLOAT64)
-        writer.write(*curve)
-        for step in range(1, 4):
-            writer.rotate()
-            time_ns = START_NS + step * 10**9
-            writer.write('/valve_opening', float64(step), time_ns, time_ns)
-    assert writer.written == 4
-    for number in (1, 2, 3):
-        topic, log_ns, publish_ns, message = by_mcap(folder / f'log_{number}.mcap')[0]
-        assert (topic, publish_ns, message.data) == ('/curve', START_NS, 7.0)
-        assert log_ns == START_NS + number * 10**9
-    contents = open_log(folder)
-    assert [m.topic for m in contents.iter_messages()] == ['/curve', *['/valve_opening'] * 3]
-    assert contents.readings.value.tolist() == [1.0, 2.0, 3.0]
-
-
-def test_a_topic_has_one_type(tmp_path):
-    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
-        writer.add_topic('/x', FLOAT64)
-        writer.add_topic('/x', FLOAT64)
-        with pytest.raises(InputError, match=r"'/x' is recorded as std_msgs/msg/Float64"):
-            writer.add_topic('/x', 'std_msgs/msg/Bool')
-
-
-def test_a_definition_may_come_from_the_caller(tmp_path):
-    with RecordingWriter(tmp_path / 'log', definitions=STOCK) as writer:
+def test_a_topic_has_one_type_and_perhaps_a_definition_of_the_caller(tmp_path):
+    with RecordingWriter(tmp_path, definitions=STOCK) as writer:
         writer.add_topic('/x', 'demo_msgs/msg/One', definition='float64 data\n')
+        writer.add_topic('/x', 'demo_msgs/msg/One')
+        with pytest.raises(InputError, match=r"'/x' is recorded as demo_msgs/msg/One"):
+            writer.add_topic('/x', 'std_msgs/msg/Bool')
         writer.write('/x', float64(3.0), 1, 1)
-    contents = open_log(tmp_path / 'log')
+    contents = open_log(tmp_path)
     [message] = contents.iter_messages()
     assert contents.decoder('/x').decode(message.data) == {'data': 3.0}
     assert contents.topics['/x'].type_hash.startswith('RIHS01_')
 
 
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
-    (tmp_path / 'file').write_text('')
-    with pytest.raises(RecordingError, match='cannot be written'):
-        RecordingWriter(tmp_path / 'file' / 'log')
-
-
-def write_and_stumble(folder):
-    with RecordingWriter(folder, definitions=STOCK) as writer:
-        writer.add_topic('/x', FLOAT64)
-        writer.write('/x', float64(1.0), 1, 1)
-        writer.flush()
-        writer.write('/unknown', b'', 1, 1)
-
-
 def test_an_error_within_leaves_the_file_unfinished(tmp_path):
+    def stumble():
+        with RecordingWriter(tmp_path, name='log', definitions=STOCK) as writer:
+            writer.add_topic('/x', FLOAT64)
+            writer.write('/x', float64(1.0), 1, 1)
+            writer.flush()
+            writer.write('/unknown', b'', 1, 1)
+
     with pytest.raises(KeyError):
-        write_and_stumble(tmp_path / 'log')
-    assert [p.name for p in (tmp_path / 'log').iterdir()] == ['log_0.mcap.part']
+        stumble()
+    assert names_in(tmp_path) == ['log_0.mcap.part']
 
 
 def node_modules():
@@ -247,13 +216,6 @@ def test_the_reader_of_foxglove_reads_the_file(tmp_path, samples):
         lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         found = [json.loads(line) for line in lines.splitlines()]
         assert [(int(f['log']), int(f['publish']), f['value']) for f in found] == expected
-
-
-def test_both_ways_of_reading_agree(samples):
-    folder, rows = samples
-    found = read_back(open_log(folder))
-    assert [r.time_ns for r in found] == [t for t, _ in rows for _ in range(5)]
-    assert [r.value for r in found] == [v for _, values in rows for v in values]
 
 
 LOADS_NOTHING = """
@@ -281,3 +243,82 @@ def test_writing_begins_without_loading_anything(tmp_path):
         check=True, capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': paths},
     )  # fmt: skip
     assert done.stdout.strip() == '[]'
+
+
+# Samples ---------------------------------------------------------------------------------------
+
+
+def test_samples_come_back_bit_for_bit_and_strangers_read_the_same(tmp_path):
+    table = wander(3000, seed=11, command=True)
+    # A recording of plain numbers has no place for doubts.
+    readings = table_to_readings(table)
+    written = write_samples(table, tmp_path / 'log.mcap', definitions=STOCK)
+    contents = open_log(written.path)
+    found, log_ns = contents.readings, contents.log_time_ns
+    assert written.messages == len(readings) == len(found)
+    assert np.array_equal(found.time_ns, readings.time_ns)
+    assert np.array_equal(found.signal, readings.signal)
+    assert np.array_equal(found.value, readings.value, equal_nan=True)
+    assert not found.quality.any()
+    assert (np.diff(log_ns) > 0).all()
+    assert np.abs(log_ns - readings.time_ns).max() <= 4
+    assert contents.warnings == ()
+    told = [(m.log_ns, m.publish_ns) for m in stock(written.path)]
+    assert told == list(zip(log_ns.tolist(), found.time_ns.tolist(), strict=True))
+    with written.path.open('rb') as stream:
+        counts = make_reader(stream).get_summary().statistics.channel_message_counts
+    assert counts == {k + 1: int((readings.signal == k).sum()) for k in range(5)}
+    values = [message.data for _, _, message in by_rosbags(tmp_path)]
+    assert np.array_equal(values, found.value, equal_nan=True)
+
+
+def test_a_folder_when_the_name_is_no_file(tmp_path):
+    folder = tmp_path / 'ten'
+    written = write_samples(
+        wander(10, seed=1), folder, definitions=STOCK, prefix='/u1/',
+        attachments={'truth.json': b'{}'}, metadata={'simulation': {'seed': '1'}},
+    )  # fmt: skip
+    assert written.path == folder / 'ten_0.mcap'
+    contents = open_log(folder)
+    assert set(contents.topics) == {f'/u1/{info.topic}' for info in SIGNALS[:4]}
+    assert contents.attachments == {'truth.json': b'{}'}
+    assert contents.metadata['simulation'] == {'seed': '1'}
+    assert information(folder)['message_count'] == written.messages
+    assert modes_in(folder) == {0o600}
+
+
+def test_nothing_is_overwritten_unless_asked(tmp_path):
+    path, _, _ = write_chunks(tmp_path / 'log')
+    before, told = path.read_bytes(), (path.parent / 'metadata.yaml').read_bytes()
+    with pytest.raises(RecordingError, match='exists already'):
+        write_samples(wander(20, seed=2), path, definitions=STOCK)
+    assert path.read_bytes() == before
+    # The description of another recording stays, that of a file that is replaced does not.
+    write_samples(wander(10, seed=1), path.parent / 'other.mcap', definitions=STOCK)
+    assert (path.parent / 'metadata.yaml').read_bytes() == told
+    written = write_samples(wander(20, seed=2), path, definitions=STOCK, overwrite=True)
+    assert len(open_log(path).readings) == written.messages
+    assert (path.parent / 'metadata.yaml').read_bytes() != told
+
+
+def test_what_cannot_be_written_is_one_sentence(tmp_path):
+    early = SampleTable.from_columns(np.array([-5], dtype=np.int64), {})
+    for table, why in ((wander(3, seed=1).part(0, 0), 'no samples'), (early, 'before 1970')):
+        with pytest.raises(DataError, match=why):
+            write_samples(table, tmp_path / 'log.mcap', definitions=STOCK)
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='cannot be written'):
+        write_samples(wander(3, seed=1), tmp_path / 'file' / 'log.mcap', definitions=STOCK)
+    assert names_in(tmp_path) == ['file']
+
+
+def test_readings_are_the_same_from_any_kind_of_file(tmp_path):
+    table = wander(500, seed=21)
+    quality = np.where(np.isnan(table.values), 2, 0).astype(np.uint8)
+    plain = SampleTable(table.time_ns, table.values, quality)
+    write_table(plain, tmp_path / 'table.csv')
+    write_samples(plain, tmp_path / 'log.mcap', definitions=STOCK)
+    first, second = (open_log(tmp_path / n).readings for n in ('table.csv', 'log.mcap'))
+    assert np.array_equal(first.time_ns, second.time_ns)
+    assert np.array_equal(first.value, second.value, equal_nan=True)
+    assert not same_arrays(first, second), 'a table knows which values are missing'

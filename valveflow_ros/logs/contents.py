@@ -27,18 +27,9 @@ class LoggedMessage(NamedTuple):
 class TopicInfo:
     """A topic of a recording.
 
-    Attributes
-    ----------
-    name, type : str
-        Its name and ``package/msg/Type``.
-    count : int
-        Number of intact messages.
-    signal : Signal or None
-        The input that it carries; None if it is not read as an input.
-    definition : str
-        The ros2msg text of its type; empty if the file has none.
-    type_hash : str
-        RIHS01 hash; empty if the file has none.
+    ``type`` is ``package/msg/Type``, ``count`` the number of intact messages. ``signal`` is the
+    input that it carries, None if it is not read as an input. ``definition`` is the ros2msg text
+    of its type and ``type_hash`` its RIHS01 hash; empty if the file has none.
     """
 
     name: str
@@ -50,11 +41,6 @@ class TopicInfo:
 
 
 Messages = Callable[[Collection[str] | None], Iterator[LoggedMessage]]
-
-
-def no_messages(topics: Collection[str] | None) -> Iterator[LoggedMessage]:
-    """Yield nothing: a table has no raw messages."""
-    return iter(())
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +72,7 @@ class LogContents:
         Number of places where data were lost.
     messages : callable
         Yields the raw messages of the given topics (None for all) in the order of their log
-        times; see `iter_messages`.
+        times; see `iter_messages`. A table has none.
     units : dict[Signal, str]
         The unit that the log states for a signal, for example in the head of a column.
     grounds : dict[Signal, str]
@@ -106,7 +92,7 @@ class LogContents:
     start_ns: int | None = None
     end_ns: int | None = None
     damaged_chunks: int = 0
-    messages: Messages = no_messages
+    messages: Messages = lambda topics: iter(())
     units: dict[Signal, str] = field(default_factory=dict)
     grounds: dict[Signal, str] = field(default_factory=dict)
     understood: list[str] = field(default_factory=list)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -30,21 +30,12 @@ _TOPICS = {info.topic for info in SIGNALS}
 def signal_of(name: str) -> Signal:
     """Return the signal of a contract name, written as topic or as column.
 
-    Raises
-    ------
-    InputError
-        If there is no such name.
+    Raises `InputError` if there is no such name.
     """
-    try:
-        return _BY_NAME[name]
-    except KeyError:
+    if name not in _BY_NAME:
         known = ', '.join(info.column for info in SIGNALS)
-        raise InputError(f"There is no signal '{name}'; there are {known}.") from None
-
-
-def signals_of(names: Iterable[str]) -> set[Signal]:
-    """Return the signals of several contract names; raises like `signal_of`."""
-    return {signal_of(name) for name in names}
+        raise InputError(f"There is no signal '{name}'; there are {known}.")
+    return _BY_NAME[name]
 
 
 def last_part(topic: str) -> str:
@@ -60,10 +51,7 @@ def has_earlier_codes(definition: str) -> bool:
 def qualities(definition: str = '') -> ByteArray:
     """Return the `Quality` of each quality code of a PlantSample, shape (256,).
 
-    Parameters
-    ----------
-    definition : str
-        The ros2msg text in the recording; empty for the current definition.
+    ``definition`` is the ros2msg text in the recording; empty for the current definition.
     """
     # Unknown codes count as bad.
     found = np.full(256, int(Quality.BAD), dtype=np.uint8)
@@ -75,42 +63,27 @@ def qualities(definition: str = '') -> ByteArray:
 class TopicChoice:
     """Selects the topics of a recording that are read as inputs.
 
-    Parameters
-    ----------
-    wanted : mapping of str to str
-        The topic to use for a contract name (or ``plant_sample``).
-
-    Raises
-    ------
-    InputError
-        If a contract name is unknown.
+    ``wanted`` gives the topic to use for a contract name (or ``plant_sample``). Raises
+    `InputError` if a contract name is unknown.
     """
 
     def __init__(self, wanted: Mapping[str, str]) -> None:
-        self._stamped = wanted.get(PLANT_SAMPLE_TOPIC)
-        self._wanted = {
-            signal_of(name): topic for name, topic in wanted.items() if name != PLANT_SAMPLE_TOPIC
-        }
-        self._wanted_topics = {_rooted(topic) for topic in wanted.values()}
+        by_name = dict(wanted)
+        self._wanted_topics = {_rooted(topic) for topic in by_name.values()}
+        self._stamped = by_name.pop(PLANT_SAMPLE_TOPIC, None)
+        self._wanted = {signal_of(name): topic for name, topic in by_name.items()}
 
     def may_matter(self, topic: str, type_name: str) -> bool:
         """Return True if `signals` or `plant_sample` may select the topic."""
-        if type_name == FLOAT64:
-            return last_part(topic) in _TOPICS or _rooted(topic) in self._wanted_topics
-        if type_name == PLANT_SAMPLE:
-            named = last_part(topic) == PLANT_SAMPLE_TOPIC
-            return named or _rooted(topic) in self._wanted_topics
-        return False
+        names = {FLOAT64: _TOPICS, PLANT_SAMPLE: {PLANT_SAMPLE_TOPIC}}.get(type_name)
+        if names is None:
+            return False
+        return last_part(topic) in names or _rooted(topic) in self._wanted_topics
 
     def signals(self, types: Mapping[str, str], path: str) -> dict[str, Signal]:
         """Return the Float64 topics to read and the signal of each.
 
-        Parameters
-        ----------
-        types : mapping of str to str
-            Type of every topic of the recording.
-        path : str
-            The recording, for error messages.
+        ``types`` gives the type of every topic of the recording, ``path`` is for error messages.
 
         Raises
         ------
@@ -124,9 +97,7 @@ class TopicChoice:
             wanted = self._wanted.get(info.signal)
             if wanted is not None:
                 chosen[_present(wanted, info.topic, FLOAT64, types, path)] = info.signal
-                continue
-            topic = _only(info.topic, FLOAT64, types, path)
-            if topic is not None:
+            elif (topic := _only(info.topic, FLOAT64, types, path)) is not None:
                 chosen.setdefault(topic, info.signal)
         return chosen
 

@@ -14,10 +14,9 @@ import fcntl
 import os
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
 
 PART_SUFFIX = '.part'
 FILE_MODE = 0o600
@@ -30,39 +29,13 @@ class AlteredError(OSError):
     """Another program removed, replaced or changed a file that is being written."""
 
 
-class Writable(Protocol):
-    """Interface of the file to which a recording is written."""
-
-    def write(self, data: bytes) -> int:
-        """Append bytes and return how many were written; raises `OSError`."""
-
-    def sync(self) -> None:
-        """Flush all data to disk; raises `OSError`."""
-
-    def check(self, size: int) -> None:
-        """Check that the file still has its name and ``size`` bytes; raises `AlteredError`."""
-
-    def check_content(self, size: int, crc: int) -> None:
-        """Read ``size`` bytes back; raises `AlteredError` if they have another CRC-32."""
-
-    @property
-    def touched(self) -> bool:
-        """Return True if another program may have written to the file since the last `write`."""
-
-    path: Path
-
-    def publish(self) -> None:
-        """Rename the file to its final name, ``path``; raises `OSError`."""
-
-    def close(self) -> None:
-        """Close the file, finished or not."""
-
-    def discard(self) -> None:
-        """Close and remove an unfinished file."""
+def _os_error(number: int, path: Path) -> OSError:
+    # Python makes of it what the number says, such as a `FileExistsError`.
+    return OSError(number, os.strerror(number), str(path))
 
 
 class PartFile:
-    """A file on disk; see `Writable`.
+    """A file on disk that is being written.
 
     Parameters
     ----------
@@ -100,12 +73,8 @@ class PartFile:
     def check(self, size: int) -> None:
         """Check that the file still has its name and ``size`` bytes.
 
-        Raises
-        ------
-        AlteredError
-            If not; the text continues a sentence that begins with the file's name.
-        OSError
-            If this cannot be determined.
+        Raises `AlteredError` if not, whose text continues a sentence that begins with the file's
+        name, and `OSError` if this cannot be determined.
         """
         self._check_name(self.part)
         if os.fstat(self._descriptor).st_size != size:
@@ -133,17 +102,13 @@ class PartFile:
     def publish(self) -> None:
         """Rename the file to its final name, durably.
 
-        Raises
-        ------
-        FileExistsError
-            If another file has that name and must not be replaced.
-        AlteredError, OSError
-            As in `check`, or if the file cannot be renamed.
+        Raises `FileExistsError` if another file has that name and must not be replaced, and as
+        `check` does.
         """
         os.fsync(self._descriptor)
         self._check_name(self.part)
         if not self._replace and os.path.lexists(self.path):
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
+            raise _os_error(errno.EEXIST, self.path)
         os.replace(self.part, self.path)
         # Another program may have replaced the file since the first check.
         self._check_name(self.path)
@@ -165,7 +130,6 @@ class PartFile:
         self.close()
 
     def _check_name(self, path: Path) -> None:
-        """Raise `AlteredError` unless ``path`` is the name of the open file."""
         try:
             named = path.lstat()
         except (FileNotFoundError, NotADirectoryError):
@@ -193,14 +157,14 @@ def _made(part: Path) -> int:
             os.close(descriptor)
             raise
         os.close(descriptor)
-    raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(part))
+    raise _os_error(errno.ENOENT, part)
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[PartFile]:
+def new_file(path: Path, kind: Callable[..., PartFile] = PartFile) -> Iterator[PartFile]:
     """Yield a file to write and publish; it is removed if anything fails before that."""
     make_folder(path.parent)
-    out = PartFile(path, replace=True)
+    out = kind(path, replace=True)
     try:
         yield out
     except BaseException:
@@ -224,9 +188,7 @@ def make_folder(folder: Path) -> None:
             try:
                 missing.mkdir(mode=FOLDER_MODE, exist_ok=True)
             except FileExistsError:
-                raise NotADirectoryError(
-                    errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(missing)
-                ) from None
+                raise _os_error(errno.ENOTDIR, missing) from None
 
 
 def is_held(part: Path) -> bool:
@@ -283,7 +245,5 @@ def mark_of(path: Path) -> tuple[int, ...] | None:
         found, link = path.stat(), path.lstat()
     except OSError:
         return None
-    return (
-        found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns,
-        link.st_ino,
-    )  # fmt: skip
+    times = found.st_mtime_ns, found.st_ctime_ns
+    return found.st_dev, found.st_ino, found.st_size, *times, link.st_ino

@@ -4,9 +4,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import shutil
+import sqlite3
+import tempfile
+import weakref
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import quote
 
 import yaml
 
@@ -16,13 +22,13 @@ except ImportError:  # PyYAML was built without libyaml
     from yaml import SafeLoader  # type: ignore[assignment]
 
 from valveflow_ros.errors import RecordingError
-from valveflow_ros.logs.contents import LogContents
+from valveflow_ros.logs.contents import LogContents, LoggedMessage, Messages
 from valveflow_ros.logs.mcap.folder import METADATA_NAME, recording_files
 from valveflow_ros.logs.mcap.reading import read_recording
 from valveflow_ros.logs.mcap.records import MAGIC
+from valveflow_ros.logs.mcap.writer import RecordingWriter
 from valveflow_ros.logs.part_file import PART_SUFFIX
 from valveflow_ros.logs.source import Source, os_errors
-from valveflow_ros.logs.sqlite import read_bag
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
 from valveflow_ros.logs.tables.table import open_table
 
@@ -69,13 +75,13 @@ def open_log(
         is_folder = False
     if is_folder:
         files, warnings = _files_of(place)
-        read = read_bag if files[0].suffix == BAG_SUFFIX else read_recording
+        read = _read_bag if files[0].suffix == BAG_SUFFIX else read_recording
         contents = read(files, str(path), names)
         return replace(contents, warnings=(*warnings, *contents.warnings))
     if place.suffix.lower() in TABLE_SUFFIXES:
         return open_table(place, names, absent, table)
     if place.suffix.lower() == BAG_SUFFIX:
-        return read_bag([place], str(path), names)
+        return _read_bag([place], str(path), names)
     if place.suffix.lower() not in ('.mcap', PART_SUFFIX):
         with Source.open(place) as source:
             if source.read(0, len(MAGIC)) != MAGIC:
@@ -152,3 +158,75 @@ def _listed(folder: Path) -> list[str]:
         raise RecordingError(folder, f"{problem}; rewrite it with 'ros2 bag convert'")
     # Only the file name is used, so that nothing outside of the folder is read.
     return [Path(str(name)).name for name in names if name] if isinstance(names, list) else []
+
+
+# Bags that rosbag2 wrote with sqlite3, read through a temporary MCAP file.
+
+_NO_SEND_TIME = 'A bag in sqlite3 has no times of sending: values stand when they were received.'
+
+
+class _Copy:
+    """The messages of a temporary copy, which is removed together with this object."""
+
+    def __init__(self, folder: str, messages: Messages) -> None:
+        self._messages = messages
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+
+    def __call__(self, topics: Collection[str] | None) -> Iterator[LoggedMessage]:
+        yield from self._messages(topics)
+
+
+def _read_bag(paths: list[Path], name: str, columns: Mapping[str, str]) -> LogContents:
+    """Return the contents of the splits of one bag; the copy goes together with the result."""
+    folder = tempfile.mkdtemp(prefix='valveflow-')
+    try:
+        with RecordingWriter(Path(folder), name='bag') as writer:
+            if not sum(_copy(path, writer) for path in paths):
+                raise RecordingError(name, 'holds no messages')
+        contents = read_recording(sorted(Path(folder).glob('*.mcap')), name, columns)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    told = (*contents.warnings, _NO_SEND_TIME)
+    return replace(contents, warnings=told, messages=_Copy(folder, contents.messages))
+
+
+def _copy(path: Path, writer: RecordingWriter) -> int:
+    """Write the messages of one file in the order of their times; return their number."""
+    with Source.open(path):
+        pass  # raises unless it is a regular file
+    count = 0
+    try:
+        uri = f'file:{quote(str(path.resolve()))}?mode=ro'
+        with closing(sqlite3.connect(uri, uri=True)) as bag:
+            topics = dict(_topics(bag, writer))
+            rows = bag.execute(
+                'SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id'
+            )
+            for topic, time_ns, data in rows:
+                if topic in topics:
+                    writer.write(topics[topic], bytes(data), int(time_ns), int(time_ns))
+                    count += 1
+    except (sqlite3.Error, TypeError, ValueError) as error:
+        raise RecordingError(path, f'is no whole bag in sqlite3 ({error})') from None
+    return count
+
+
+def _topics(bag: sqlite3.Connection, writer: RecordingWriter) -> Iterator[tuple[int, str]]:
+    """Add the topics of a bag to a recording; yield the id and the name of each."""
+    texts: dict[str, str] = {}
+    if bag.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+        texts = dict(bag.execute(
+            'SELECT topic_type, encoded_message_definition FROM message_definitions '
+            "WHERE encoding = 'ros2msg'"
+        ))  # fmt: skip
+    for number, topic, kind, form in bag.execute(
+        'SELECT id, name, type, serialization_format FROM topics'
+    ).fetchall():
+        if form != 'cdr':
+            continue
+        try:
+            writer.add_topic(topic, kind, definition=texts.get(kind))
+        except RecordingError:  # the type is unknown, and the bag has no definition of it
+            writer.add_topic(topic, kind, definition='')
+        yield number, topic

@@ -7,10 +7,9 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 from valveflow_ros.errors import RecordingError
@@ -33,8 +32,8 @@ def printable(name: str) -> str:
     return ''.join(letter if letter.isprintable() else '?' for letter in name)
 
 
-@dataclass(slots=True)
-class Source:
+@dataclass
+class Source(AbstractContextManager['Source']):
     """A regular file and the size it had when it was opened."""
 
     path: str
@@ -43,13 +42,12 @@ class Source:
 
     @classmethod
     def open(cls, path: str | Path) -> Source:
-        """Open a regular file.
+        """Open a regular file, without blocking on a FIFO or a device.
 
         Raises
         ------
         RecordingError
-            If it is absent, unreadable, empty, or not a regular file. The call
-            does not block on a FIFO or a device.
+            If it is absent, unreadable, empty, or not a regular file.
         """
         name = str(path)
         try:
@@ -58,70 +56,36 @@ class Source:
         except ValueError:
             raise RecordingError(printable(name), 'is not a name of a file') from None
         status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode) or status.st_size == 0:
+        regular = stat.S_ISREG(status.st_mode)
+        if not regular or status.st_size == 0:
             os.close(descriptor)
-            regular = stat.S_ISREG(status.st_mode)
             raise RecordingError(name, 'is empty' if regular else 'is not a regular file')
         stream = os.fdopen(descriptor, 'rb', buffering=BUFFER_BYTES)
         return cls(name, stream, status.st_size)
 
     def read(self, position: int, size: int) -> bytes:
-        """Return up to ``size`` bytes; fewer at the end of the file.
-
-        Raises
-        ------
-        RecordingError
-            If the device fails.
-        """
+        """Return up to ``size`` bytes; raises `RecordingError` if the device fails."""
         if position >= self.size:
             return b''
         with os_errors(self.path, f'cannot be read at byte {position}'):
             self.stream.seek(position)
             return self.stream.read(min(size, self.size - position))
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file."""
         self.stream.close()
 
-    def __enter__(self) -> Source:
-        """Return itself."""
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the file."""
-        self.close()
-
-
+# Limits that a reader keeps, whatever sizes a file claims.
 MIB = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits that a reader keeps, whatever sizes a file claims.
-
-    The limits on work grow with the file size, because data of a plant are
-    compressed about ten times at most. ``work_floor_bytes + work_per_byte * size``
-    bytes may be decompressed in total, and ``failed_floor_bytes + failed_per_byte *
-    size`` bytes without a usable result.
-    """
-
-    record_bytes: int = 64 * MIB
-    chunk_bytes: int = 32 * MIB
-    channels: int = 1024
-    definition_bytes: int = 4 * MIB
-    attachment_bytes: int = 64 * MIB
-    work_floor_bytes: int = 32 * MIB
-    work_per_byte: int = 64
-    failed_floor_bytes: int = 128 * MIB
-    failed_per_byte: int = 2
-
-
-DEFAULT_LIMITS = Limits()
+RECORD_BYTES = ATTACHMENT_BYTES = 64 * MIB
+CHUNK_CONTENT_BYTES = 32 * MIB
+DEFINITION_BYTES = 4 * MIB
+MOST_TOPICS = 1024
+# The limits on work are so much, and more for each byte of the file, because data of a plant are
+# compressed about ten times at most: what is decompressed in total, and without a usable result.
+_WORK_BYTES = (32 * MIB, 64)
+_FAILED_BYTES = (128 * MIB, 2)
 
 
 class OverBudgetError(Exception):
@@ -133,18 +97,18 @@ class Budget:
 
     __slots__ = ('failed_left', 'left')
 
-    def __init__(self, file_bytes: int, limits: Limits = DEFAULT_LIMITS) -> None:
-        self.left = limits.work_floor_bytes + limits.work_per_byte * file_bytes
-        self.failed_left = limits.failed_floor_bytes + limits.failed_per_byte * file_bytes
+    def __init__(self, file_bytes: int) -> None:
+        self.left = _WORK_BYTES[0] + _WORK_BYTES[1] * file_bytes
+        self.failed_left = _FAILED_BYTES[0] + _FAILED_BYTES[1] * file_bytes
 
-    def spend(self, size: int) -> None:
-        """Count work before it is done; raises `OverBudgetError` beyond the limit."""
-        self.left -= size
-        if self.left < 0:
-            raise OverBudgetError
+    def spend(self, size: int, in_vain: bool = False) -> None:
+        """Count work before it is done, or work without a usable result.
 
-    def spend_in_vain(self, size: int) -> None:
-        """Count work without a usable result; raises `OverBudgetError` beyond the limit."""
-        self.failed_left -= size
-        if self.failed_left < 0:
+        Raises `OverBudgetError` beyond the limit.
+        """
+        if in_vain:
+            self.failed_left -= size
+        else:
+            self.left -= size
+        if min(self.left, self.failed_left) < 0:
             raise OverBudgetError

@@ -38,20 +38,9 @@ from valveflow_ros.records import (
 
 MAX_DEPTH = 32
 _CODES = {
-    'bool': '?',
-    'byte': 'B',
-    'char': 'B',
-    'int8': 'b',
-    'uint8': 'B',
-    'int16': 'h',
-    'uint16': 'H',
-    'int32': 'i',
-    'uint32': 'I',
-    'int64': 'q',
-    'uint64': 'Q',
-    'float32': 'f',
-    'float64': 'd',
-}
+    'bool': '?', 'byte': 'B', 'char': 'B', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H',
+    'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q', 'float32': 'f', 'float64': 'd',
+}  # fmt: skip
 _BYTE_LIKE = frozenset({'byte', 'char', 'uint8'})
 _BIG, _LITTLE = b'\x00\x00', b'\x00\x01'
 
@@ -59,17 +48,8 @@ _BIG, _LITTLE = b'\x00\x00', b'\x00\x01'
 class Decoder:
     """Turns messages of one type into dictionaries.
 
-    Parameters
-    ----------
-    type_name : str
-        ``package/msg/Type`` or ``package/Type``.
-    definition : str
-        Its ros2msg text with the definitions of all nested types.
-
-    Raises
-    ------
-    RecordingError
-        If the definition is incomplete or cannot be parsed.
+    ``type_name`` is ``package/msg/Type`` or ``package/Type``, ``definition`` its ros2msg text with
+    those of all nested types. Raises `RecordingError` if it is incomplete or cannot be parsed.
     """
 
     def __init__(self, type_name: str, definition: str) -> None:
@@ -84,13 +64,8 @@ class Decoder:
     def decode(self, data: bytes) -> dict[str, Any]:
         """Return the message as a dictionary.
 
-        Nested messages are dictionaries, arrays are lists, arrays of bytes
-        are `bytes`.
-
-        Raises
-        ------
-        RecordingError
-            If the bytes do not match the definition.
+        Nested messages are dictionaries, arrays are lists, arrays of bytes are `bytes`. Raises
+        `RecordingError` if the bytes do not match the definition.
         """
         try:
             return _Reader(data, self._types).message(self._name, 0)
@@ -232,14 +207,9 @@ class PlantSampleReader:
                 self._flatten(types, field.type, f'{path}.', depth + 1)
 
     def _read(
-        self,
-        content: bytes,
-        body: IntArray,
-        end: IntArray,
-        order: str,
-        samples: Samples,
+        self, content: bytes, body: IntArray, end: IntArray, order: str, samples: Samples,
         mine: IntArray,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Decode all messages field by field; ``place`` is the current offset in each of them."""
         place = np.zeros(len(body), dtype=np.int64)
         alive = np.ones(len(body), dtype=np.bool_)
@@ -259,15 +229,6 @@ class PlantSampleReader:
                 alive &= body + place <= end
             elif name in _NEEDED:
                 found[name] = value
-        self._store(found, alive, samples, mine)
-
-    def _store(
-        self,
-        found: dict[str, NDArray[np.generic]],
-        alive: NDArray[np.bool_],
-        samples: Samples,
-        mine: IntArray,
-    ) -> None:
         good = mine[alive]
         samples.good[good] = True
         seconds = found[_SEC][alive].astype(np.int64)

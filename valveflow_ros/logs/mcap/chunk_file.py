@@ -18,25 +18,13 @@ from pathlib import Path, PurePath
 
 import numpy as np
 import zstandard
+from mcap import records as made
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Statistics,
-    SummaryOffset,
-)
 from mcap.well_known import Profile
 from numpy.typing import NDArray
 
 from valveflow_ros.logs.mcap.records import MAGIC, MESSAGE_HEAD, RECORD_HEAD, TopicTable, pack
-from valveflow_ros.logs.part_file import Writable
+from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.records import IntArray
 
 CHUNK_BYTES = 64 * 1024
@@ -49,11 +37,11 @@ _HEAD = struct.Struct('<BQHIQQ')
 _INDEX_ROW = np.dtype([('log_time', '<i8'), ('offset', '<i8')])
 
 
-def attachment(name: str, data: bytes) -> Attachment:
+def attachment(name: str, data: bytes) -> made.Attachment:
     """Return the record of an attached file; its media type follows from its suffix."""
     kinds = {'.json': 'application/json', '.yaml': 'application/yaml'}
     kind = kinds.get(PurePath(name).suffix, 'application/octet-stream')
-    return Attachment(create_time=0, log_time=0, name=name, media_type=kind, data=data)
+    return made.Attachment(create_time=0, log_time=0, name=name, media_type=kind, data=data)
 
 
 def compressor() -> zstandard.ZstdCompressor:
@@ -90,14 +78,10 @@ def pack_content(
 ) -> PackedChunk:
     """Compress records into a chunk; the arrays describe the messages among the records."""
     start, end = (int(log_time.min()), int(log_time.max())) if len(log_time) else (0, 0)
-    chunk = Chunk(
-        compression=ZSTD,
-        data=packer.compress(content),
-        message_start_time=start,
-        message_end_time=end,
-        uncompressed_crc=zlib.crc32(content),
-        uncompressed_size=len(content),
-    )
+    chunk = made.Chunk(
+        compression=ZSTD, data=packer.compress(content), message_start_time=start,
+        message_end_time=end, uncompressed_crc=zlib.crc32(content), uncompressed_size=len(content),
+    )  # fmt: skip
     return PackedChunk(pack(chunk), channel, log_time, offset, len(content), ZSTD)
 
 
@@ -105,11 +89,8 @@ class ChunkBuilder:
     """Collects messages for the next chunk, in the order in which they are added."""
 
     def __init__(self) -> None:
-        self._records = bytearray()
-        self._channels: list[int] = []
-        self._log_times: list[int] = []
-        self._offsets: list[int] = []
         self._packer = compressor()
+        self.clear()
 
     def __len__(self) -> int:
         """Return the number of waiting messages."""
@@ -129,14 +110,9 @@ class ChunkBuilder:
         self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes
     ) -> None:
         """Append a message."""
-        head = _HEAD.pack(
-            Opcode.MESSAGE,
-            MESSAGE_HEAD.size + len(data),
-            channel,
-            sequence & 0xFFFFFFFF,
-            log_time_ns,
-            publish_time_ns,
-        )
+        size = MESSAGE_HEAD.size + len(data)
+        times = log_time_ns, publish_time_ns
+        head = _HEAD.pack(Opcode.MESSAGE, size, channel, sequence & 0xFFFFFFFF, *times)
         self._offsets.append(len(self._records))
         self._channels.append(channel)
         self._log_times.append(log_time_ns)
@@ -145,21 +121,18 @@ class ChunkBuilder:
 
     def build(self, table: bytes = b'') -> PackedChunk:
         """Return ``table`` and the waiting messages as a chunk; the messages are kept."""
+        channels = np.array(self._channels, dtype=np.uint16)
+        log_times = np.array(self._log_times, dtype=np.int64)
         offsets = np.array(self._offsets, dtype=np.int64) + len(table)
-        return pack_content(
-            table + bytes(self._records),
-            np.array(self._channels, dtype=np.uint16),
-            np.array(self._log_times, dtype=np.int64),
-            offsets,
-            self._packer,
-        )
+        content = table + bytes(self._records)
+        return pack_content(content, channels, log_times, offsets, self._packer)
 
     def clear(self) -> None:
         """Discard the waiting messages, after they were written."""
         self._records = bytearray()
-        self._channels = []
-        self._log_times = []
-        self._offsets = []
+        self._channels: list[int] = []
+        self._log_times: list[int] = []
+        self._offsets: list[int] = []
 
 
 class ChunkFile:
@@ -180,13 +153,9 @@ class ChunkFile:
         Bytes written.
     """
 
-    def __init__(self, out: Writable, library: str) -> None:
-        self.messages = 0
-        self.chunks = 0
+    def __init__(self, out: PartFile, library: str) -> None:
+        self.messages = self.chunks = self.position = self.start_ns = self.end_ns = 0
         self.counts: dict[int, int] = {}
-        self.start_ns = 0
-        self.end_ns = 0
-        self.position = 0
         self._out = out
         self._crc = 0
         self._suspect, self._read_back_s = False, 0.0
@@ -195,21 +164,17 @@ class ChunkFile:
         self._index: dict[Opcode, list[bytes]] = {
             Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
         }  # fmt: skip
-        self._append(MAGIC + pack(Header(profile=Profile.ROS2, library=library)))
+        self._append(MAGIC + pack(made.Header(profile=Profile.ROS2, library=library)))
 
-    def put_attachment(self, attachment: Attachment) -> None:
+    def put_attachment(self, attachment: made.Attachment) -> None:
         """Write an attachment."""
         start, packed = self.position, pack(attachment)
         self._append(packed)
-        index = AttachmentIndex(
-            offset=start,
-            length=len(packed),
-            log_time=attachment.log_time,
-            create_time=attachment.create_time,
-            data_size=len(attachment.data),
-            name=attachment.name,
-            media_type=attachment.media_type,
-        )
+        index = made.AttachmentIndex(
+            offset=start, length=len(packed), log_time=attachment.log_time,
+            create_time=attachment.create_time, data_size=len(attachment.data),
+            name=attachment.name, media_type=attachment.media_type,
+        )  # fmt: skip
         self._index[Opcode.ATTACHMENT_INDEX].append(pack(index))
 
     def put_all(self, files: Mapping[str, bytes], notes: Mapping[str, Mapping[str, str]]) -> None:
@@ -221,9 +186,9 @@ class ChunkFile:
 
     def put_metadata(self, name: str, items: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        start, packed = self.position, pack(Metadata(name=name, metadata=dict(items)))
+        start, packed = self.position, pack(made.Metadata(name=name, metadata=dict(items)))
         self._append(packed)
-        index = MetadataIndex(offset=start, length=len(packed), name=name)
+        index = made.MetadataIndex(offset=start, length=len(packed), name=name)
         self._index[Opcode.METADATA_INDEX].append(pack(index))
 
     def table_due(self, topics: int) -> bool:
@@ -232,12 +197,12 @@ class ChunkFile:
         A lost chunk must not lose the only record of a topic. The records are therefore written
         in the first two chunks after a new topic, and then every `REPEAT_CHUNKS` chunks.
         """
-        due = topics > self._topics_known or self._since_table in (0, REPEAT_CHUNKS)
         if topics > self._topics_known:
             # The chunk after this one repeats them.
             self._topics_known, self._since_table = topics, 0
-        else:
-            self._since_table = 1 if due else self._since_table + 1
+            return True
+        due = self._since_table in (0, REPEAT_CHUNKS)
+        self._since_table = 1 if due else self._since_table + 1
         return due
 
     def put_chunk(self, chunk: PackedChunk) -> None:
@@ -264,17 +229,13 @@ class ChunkFile:
             self.end_ns = max(self.end_ns, last) if self.messages else last
         self.messages += len(chunk)
         self.chunks += 1
-        index = ChunkIndex(
-            chunk_length=len(chunk.record),
-            chunk_start_offset=start,
-            compression=chunk.compression,
-            compressed_size=len(chunk.record) - RECORD_HEAD.size - 40 - len(chunk.compression),
-            message_start_time=first,
-            message_end_time=last,
-            message_index_length=len(indexes),
-            message_index_offsets=places,
-            uncompressed_size=chunk.unpacked_size,
-        )
+        packed_size = len(chunk.record) - RECORD_HEAD.size - 40 - len(chunk.compression)
+        index = made.ChunkIndex(
+            chunk_length=len(chunk.record), chunk_start_offset=start,
+            compression=chunk.compression, compressed_size=packed_size, message_start_time=first,
+            message_end_time=last, message_index_length=len(indexes),
+            message_index_offsets=places, uncompressed_size=chunk.unpacked_size,
+        )  # fmt: skip
         self._index[Opcode.CHUNK_INDEX].append(pack(index))
         self._append(indexes)
 
@@ -298,16 +259,13 @@ class ChunkFile:
     def finish(self, table: TopicTable) -> None:
         """Write the summary and rename the file to its final name.
 
-        Raises
-        ------
-        AlteredError
-            If the content of the file is not what was written.
+        Raises `AlteredError` if the content of the file is not what was written.
         """
         # Later writes of other programs are detected by the check of `touched` below.
         self._out.sync()
         self._out.check(self.position)
         self._out.check_content(self.position, self._crc)
-        self._append(pack(DataEnd(data_section_crc=self._crc)))
+        self._append(pack(made.DataEnd(data_section_crc=self._crc)))
         self._append(self._summary(table))
         self._out.publish()
         if self._out.touched:
@@ -322,17 +280,14 @@ class ChunkFile:
             self._out.discard()
 
     def _summary(self, table: TopicTable) -> bytes:
-        statistics = Statistics(
+        statistics = made.Statistics(
             attachment_count=len(self._index[Opcode.ATTACHMENT_INDEX]),
-            channel_count=len(table.channels),
+            channel_count=len(table.channels), chunk_count=self.chunks,
             channel_message_counts=dict(sorted(self.counts.items())),
-            chunk_count=self.chunks,
-            message_count=self.messages,
-            message_start_time=self.start_ns,
-            message_end_time=self.end_ns,
+            message_count=self.messages, message_start_time=self.start_ns,
+            message_end_time=self.end_ns, schema_count=len(table.schemas),
             metadata_count=len(self._index[Opcode.METADATA_INDEX]),
-            schema_count=len(table.schemas),
-        )
+        )  # fmt: skip
         groups = {
             Opcode.SCHEMA: pack(*table.schemas.values()),
             Opcode.CHANNEL: pack(*table.channels.values()),
@@ -343,11 +298,12 @@ class ChunkFile:
         for op, group in groups.items():
             if group:
                 place = start + len(summary)
-                offsets += pack(
-                    SummaryOffset(group_opcode=op, group_start=place, group_length=len(group))
+                offset = made.SummaryOffset(
+                    group_opcode=op, group_start=place, group_length=len(group)
                 )
+                offsets += pack(offset)
                 summary += group
-        footer = Footer(
+        footer = made.Footer(
             summary_start=start, summary_offset_start=start + len(summary), summary_crc=0
         )
         summary += offsets
@@ -355,10 +311,6 @@ class ChunkFile:
         return summary + pack(footer) + MAGIC
 
     def _append(self, data: bytes) -> None:
-        self._write(data)
-        self._crc = zlib.crc32(data, self._crc)
-
-    def _write(self, data: bytes) -> None:
         left = memoryview(data)
         while left:
             taken = self._out.write(bytes(left) if len(left) < len(data) else data)
@@ -366,3 +318,4 @@ class ChunkFile:
                 raise OSError(5, 'nothing could be written')
             self.position += taken
             left = left[taken:]
+        self._crc = zlib.crc32(data, self._crc)

@@ -79,12 +79,12 @@ DiagnosticStatus[] status
 # Only fields are kept: constants, defaults and comments are skipped.
 # A text may hold further definitions after lines of ``=``, as in recordings.
 
-PRIMITIVES = frozenset(
-    {
-        'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16',
-        'int32', 'uint32', 'int64', 'uint64', 'string', 'wstring',
-    }
-)  # fmt: skip
+# Each with its number in a type's description, see below.
+# A char of a .msg file is an unsigned byte, unlike the char of type descriptions.
+PRIMITIVES = {
+    'int8': 2, 'uint8': 3, 'char': 3, 'int16': 4, 'uint16': 5, 'int32': 6, 'uint32': 7, 'int64': 8,
+    'uint64': 9, 'float32': 10, 'float64': 11, 'bool': 15, 'byte': 16, 'string': 17, 'wstring': 18,
+}  # fmt: skip
 SEPARATOR = '=' * 80
 MAX_TYPES = 256
 MAX_FIELDS = 4096
@@ -125,11 +125,6 @@ def full_name(name: str) -> str:
     return f'{match.group(1)}/msg/{match.group(2)}'
 
 
-def short_name(name: str) -> str:
-    """Return ``package/Type``, the form used after a separator in recordings."""
-    return full_name(name).replace('/msg/', '/')
-
-
 def parse_fields(text: str, package: str) -> Fields:
     """Return the fields of one definition; ``package`` is used for type names without one."""
     fields: list[Field] = []
@@ -150,10 +145,7 @@ def parse_fields(text: str, package: str) -> Fields:
 def parse_all(type_name: str, text: str) -> dict[str, Fields]:
     """Return the fields of a type and of all types that follow it in the text.
 
-    Raises
-    ------
-    LayoutError
-        If a name or a line cannot be parsed.
+    Raises `LayoutError` if a name or a line cannot be parsed.
     """
     main, *parts = _BREAK.split(text)
     if len(parts) > MAX_TYPES:
@@ -167,11 +159,6 @@ def parse_all(type_name: str, text: str) -> dict[str, Fields]:
     return {name: parse_fields(body, name.split('/')[0]) for name, body in types.items()}
 
 
-def dependencies(fields: Fields) -> list[str]:
-    """Return the message types of the fields, each once, in order."""
-    return list(dict.fromkeys(f.type for f in fields if f.type not in PRIMITIVES))
-
-
 def collect(type_name: str, types: Mapping[str, Fields]) -> list[str]:
     """Return the types that a type needs, itself first; raises `LayoutError` if one is missing."""
     needed, waiting = [], [full_name(type_name)]
@@ -182,7 +169,7 @@ def collect(type_name: str, types: Mapping[str, Fields]) -> list[str]:
         if name not in types:
             raise LayoutError(f"the definition of '{name}' is missing")
         needed.append(name)
-        waiting += dependencies(types[name])
+        waiting += (f.type for f in types[name] if f.type not in PRIMITIVES)
     return needed
 
 
@@ -192,36 +179,16 @@ def _field(match: re.Match[str], package: str) -> Field:
         base = 'std_msgs/Header'
     if base not in PRIMITIVES:
         base = full_name(base if '/' in base else f'{package}/{base}')
-    bound = int(match['bound'] or 0)
-    if match['array'] is None:
-        return Field(match['name'], base, '', 0, bound)
-    if not match['length']:
-        return Field(match['name'], base, 'unbounded', 0, bound)
-    kind = 'bounded' if match['upto'] else 'fixed'
-    return Field(match['name'], base, kind, int(match['length']), bound)
+    kind = ''
+    if match['array'] is not None:
+        kind = 'bounded' if match['upto'] else 'fixed'
+        kind = kind if match['length'] else 'unbounded'
+    return Field(match['name'], base, kind, int(match['length'] or 0), int(match['bound'] or 0))
 
 
 # Type hashes RIHS01: the SHA-256 of a type's description (ROS Enhancement Proposal 2011).
 
 _NESTED = 1
-_IDS = {
-    'int8': 2,
-    'uint8': 3,
-    'int16': 4,
-    'uint16': 5,
-    'int32': 6,
-    'uint32': 7,
-    'int64': 8,
-    'uint64': 9,
-    'float32': 10,
-    'float64': 11,
-    # A char of a .msg file is an unsigned byte, unlike the char of type descriptions.
-    'char': 3,
-    'bool': 15,
-    'byte': 16,
-    'string': 17,
-    'wstring': 18,
-}
 _BOUNDED_TEXT = 4
 _ARRAY_STEP = {'': 0, 'fixed': 48, 'bounded': 96, 'unbounded': 144}
 # A message without fields gets one, because C has no empty structures.
@@ -231,10 +198,7 @@ _FILLER: Fields = (Field('structure_needs_at_least_one_member', 'uint8'),)
 def type_hash(type_name: str, types: Mapping[str, Fields]) -> str:
     """Return ``RIHS01_`` and 64 hexadecimal digits.
 
-    Raises
-    ------
-    LayoutError
-        If the definition of a type it needs is missing.
+    Raises `LayoutError` if the definition of a type it needs is missing.
     """
     main, *others = collect(type_name, types)
     description = {
@@ -251,19 +215,14 @@ def _describe(name: str, types: Mapping[str, Fields]) -> dict[str, Any]:
 
 
 def _described_field(field: Field) -> dict[str, Any]:
-    primitive = field.type in PRIMITIVES
-    number = _IDS[field.type] if primitive else _NESTED
-    if field.text_bound:
-        number += _BOUNDED_TEXT
-    return {
-        'name': field.name,
-        'type': {
-            'type_id': number + _ARRAY_STEP[field.array],
-            'capacity': field.length,
-            'string_capacity': field.text_bound,
-            'nested_type_name': '' if primitive else field.type,
-        },
+    number = PRIMITIVES.get(field.type, _NESTED) + (_BOUNDED_TEXT if field.text_bound else 0)
+    kind = {
+        'type_id': number + _ARRAY_STEP[field.array],
+        'capacity': field.length,
+        'string_capacity': field.text_bound,
+        'nested_type_name': '' if field.type in PRIMITIVES else field.type,
     }
+    return {'name': field.name, 'type': kind}
 
 
 OWN_PACKAGE = 'valveflow_msgs'
@@ -299,7 +258,8 @@ class Definitions:
         main, *others = self._needed(type_name)
         parts = [self._texts[main]]
         for name in others:
-            parts.append(f'{SEPARATOR}\nMSG: {short_name(name)}\n{self._texts[name]}')
+            short = name.replace('/msg/', '/')
+            parts.append(f'{SEPARATOR}\nMSG: {short}\n{self._texts[name]}')
         return '\n'.join(parts)
 
     def type_hash(self, type_name: str) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from mcap.records import Channel
 from valveflow_ros import __version__
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs.mcap.chunk_file import ChunkFile
-from valveflow_ros.logs.mcap.records import TopicTable, read_summary
+from valveflow_ros.logs.mcap.records import Summary, TopicTable, read_summary
 from valveflow_ros.logs.part_file import PART_SUFFIX, write_whole
 from valveflow_ros.logs.source import Source, os_errors
 
@@ -42,16 +43,16 @@ class Split:
     counts: dict[str, int] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, name: str, table: TopicTable, counts: Mapping[int, int], times: tuple[int, int]
-    ) -> Split:
-        """Describe a file by its topics, the number of messages per channel, and its times."""
+    def of(cls, name: str, table: TopicTable, file: ChunkFile | Summary) -> Split:
+        """Describe a file by its topics and by what was written, or by its summary."""
         topics: dict[str, tuple[str, Channel]] = {}
         by_topic: dict[str, int] = {}
         for number, channel in table.channels.items():
             topics[channel.topic] = (table.type_of(channel), channel)
-            by_topic[channel.topic] = by_topic.get(channel.topic, 0) + counts.get(number, 0)
-        return cls(name, times[0], times[1], sum(counts.values()), topics, by_topic)
+            count = file.counts.get(number, 0)
+            by_topic[channel.topic] = by_topic.get(channel.topic, 0) + count
+        total = sum(file.counts.values())
+        return cls(name, file.start_ns, file.end_ns, total, topics, by_topic)
 
     @classmethod
     def read(cls, path: Path) -> Split | None:
@@ -61,10 +62,7 @@ class Split:
                 summary = read_summary(source)
         except RecordingError:
             return None
-        if summary is None:
-            return None
-        times = (summary.start_ns, summary.end_ns)
-        return cls.of(path.name, summary.table, summary.counts, times)
+        return None if summary is None else cls.of(path.name, summary.table, summary)
 
 
 def split_number(path: Path) -> int:
@@ -105,15 +103,16 @@ def finished_files(folder: Path) -> list[Path]:
 
 def finish_split(file: ChunkFile, name: str, table: TopicTable) -> Split:
     """Finish a file that has, or will have, this name; raises `OSError`."""
-    split = Split.of(name, table, file.counts, (file.start_ns, file.end_ns))
-    file.put_metadata('rosbag2', {'serialized_metadata': information_text([split])})
+    split = Split.of(name, table, file)
+    file.put_metadata('rosbag2', {'serialized_metadata': _information([split])})
     file.finish(table)
     return split
 
 
 def write_metadata(folder: Path, splits: Collection[Split]) -> None:
     """Write `metadata.yaml` for these splits; raises `OSError`."""
-    write_whole(folder / METADATA_NAME, metadata_text(splits).encode())
+    text = 'rosbag2_bagfile_information:\n' + textwrap.indent(_information(splits), '  ')
+    write_whole(folder / METADATA_NAME, text.encode())
 
 
 def finished_splits(folder: Path, known: Mapping[str, Split] = {}) -> dict[str, Split]:
@@ -125,14 +124,10 @@ def finished_splits(folder: Path, known: Mapping[str, Split] = {}) -> dict[str, 
     return {name: split for name, split in found.items() if split is not None}
 
 
-def metadata_text(splits: Collection[Split]) -> str:
-    """Return the text of `metadata.yaml`."""
-    return 'rosbag2_bagfile_information:\n' + textwrap.indent(information_text(splits), '  ')
-
-
-def information_text(splits: Collection[Split]) -> str:
+def _information(splits: Collection[Split]) -> str:
     """Return the text under the first key of `metadata.yaml`; a split's metadata has it, too."""
-    start, duration = _span([s for s in splits if s.messages])
+    times = [time for s in splits if s.messages for time in (s.start_ns, s.end_ns)] or [0]
+    start, duration = min(times), max(times) - min(times)
     lines = [
         f'version: {METADATA_VERSION}',
         'storage_identifier: mcap',
@@ -153,20 +148,12 @@ def information_text(splits: Collection[Split]) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _span(splits: list[Split]) -> tuple[int, int]:
-    if not splits:
-        return 0, 0
-    start = min(split.start_ns for split in splits)
-    return start, max(split.end_ns for split in splits) - start
-
-
 def _topic_lines(splits: Collection[Split]) -> list[str]:
     topics: dict[str, tuple[str, Channel]] = {}
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for split in splits:
         topics.update(split.topics)
-        for topic, count in split.counts.items():
-            counts[topic] = counts.get(topic, 0) + count
+        counts.update(split.counts)
     lines = []
     for topic, (kind, channel) in topics.items():
         qos = channel.metadata.get('offered_qos_profiles', '')
@@ -193,6 +180,5 @@ def _file_lines(split: Split) -> str:
     )
 
 
-def _quoted(text: str) -> str:
-    # A JSON string is a YAML string.
-    return json.dumps(text)
+# A JSON string is a YAML string.
+_quoted = json.dumps

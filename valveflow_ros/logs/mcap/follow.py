@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -34,37 +35,36 @@ from valveflow_ros.logs.mcap.records import (
     unpack_attachment,
     walk,
 )
-from valveflow_ros.logs.mcap.scan import CHUNK_HEAD_SIZE, Scanner, candidates, is_foreign
+from valveflow_ros.logs.mcap.scan import (
+    CHUNK_HEAD_SIZE,
+    Scanner,
+    candidates,
+    has_chunk_at,
+    is_foreign,
+)
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, last_part, signal_of
 from valveflow_ros.logs.part_file import PART_SUFFIX, is_held
-from valveflow_ros.logs.source import DEFAULT_LIMITS, OverBudgetError, Source
+from valveflow_ros.logs.source import RECORD_BYTES, OverBudgetError, Source
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 
 # A monitor publishes its state again within a day, so older messages are not needed.
 LOOK_BACK_NS = 25 * 3600 * NS_PER_S
 
 
-def part_of(path: Path) -> Path:
-    """Return the name that a file has while it is written."""
-    return path.with_name(path.name + PART_SUFFIX)
-
-
-def final_of(path: Path) -> Path:
+def _final(path: Path) -> Path:
     """Return the name that a file has when it is finished."""
     return path.with_suffix('') if path.suffix == PART_SUFFIX else path
 
 
-def files_in(folder: Path) -> list[Path]:
-    """Return the files of a folder by their final names, in order; raises `RecordingError`."""
-    return in_order({final_of(path) for path in recording_files(folder)})
+def _files_in(folder: Path) -> list[Path]:
+    return in_order({_final(path) for path in recording_files(folder)})
 
 
-def first_in(folder: Path) -> Path | None:
+def _first_in(folder: Path) -> Path | None:
     """Return the first file with messages of the last 25 hours; None if there is no file."""
-    files = files_in(folder)
     begin: Path | None = None
     newest = 0
-    for path in reversed(files):
+    for path in reversed(_files_in(folder)):
         split = Split.read(path) if path.exists() else None
         if split is not None and split.messages:
             newest = newest or split.end_ns
@@ -99,31 +99,17 @@ class Batch:
 class Follower:
     """Reads a recording; each call continues where the last one stopped.
 
-    Parameters
-    ----------
-    path : Path
-        An ``.mcap`` file, an ``.mcap.part`` file, or the folder of a recording,
-        finished or growing. A file may be renamed to its final name meanwhile,
-        and a folder may get further files.
-
-    Attributes
-    ----------
-    attachments : dict[str, bytes]
-        Small attached files by name.
-    damaged : int
-        Number of places where data were left out.
-
-    Raises
-    ------
-    RecordingError
-        If ``path`` does not exist or is not a recording.
+    ``path`` is an ``.mcap`` file, an ``.mcap.part`` file, or the folder of a recording, finished
+    or growing. A file may be renamed to its final name meanwhile, and a folder may get further
+    files. ``attachments`` are small attached files by name, ``damaged`` is the number of places
+    where data were left out. Raises `RecordingError` if ``path`` is not a recording.
     """
 
     def __init__(self, path: Path) -> None:
         self.attachments: dict[str, bytes] = {}
         self.damaged = 0
         self._folder = path if path.is_dir() else None
-        self._current: Path | None = None if self._folder else final_of(path)
+        self._current: Path | None = None if self._folder else _final(path)
         self._ended = False
         self._started = self._current
         self._order: list[Path] = []
@@ -152,13 +138,15 @@ class Follower:
     @property
     def written(self) -> bool:
         """Return True if a living writer holds the current file."""
-        if self._current is None:
-            return False
-        part = part_of(self._current)
-        try:
-            return part.exists() and is_held(part)
-        except OSError:
-            return False
+        if self._current is not None:
+            with suppress(OSError):
+                return is_held(self._part)
+        return False
+
+    @property
+    def _part(self) -> Path:
+        """Return the name that the current file has while it is written."""
+        return Path(f'{self._current}{PART_SUFFIX}')
 
     @property
     def size(self) -> int:
@@ -166,13 +154,7 @@ class Follower:
         return self._position
 
     def read(self) -> Iterator[Batch]:
-        """Yield what was added since the last call.
-
-        Raises
-        ------
-        RecordingError
-            If the files cannot be read.
-        """
+        """Yield what was added since the last call; raises `RecordingError`."""
         while self._find():
             yield from self._rest_of_file()
             following = self._following()
@@ -183,25 +165,23 @@ class Follower:
 
     def _find(self) -> bool:
         if self._current is None and self._folder is not None:
-            self._current = self._started = first_in(self._folder)
+            self._current = self._started = _first_in(self._folder)
         return self._current is not None and not (self._folder is None and self._ended)
 
     def _following(self) -> Path | None:
         """Return the next file, or None if there is none or the current one may still grow."""
         if self._folder is None or self._current is None or (not self._ended and self.written):
             return None
-        later = in_order({*files_in(self._folder), self._current})
+        later = in_order({*_files_in(self._folder), self._current})
         place = later.index(self._current) + 1
         return later[place] if place < len(later) else None
 
     def _open(self) -> Source:
         """Open the current file, under its temporary or its final name."""
         assert self._current is not None
-        part = part_of(self._current)
         try:
-            return Source.open(part if part.exists() else self._current)
+            return Source.open(self._part)
         except RecordingError:
-            # It may have been renamed after the check.
             return Source.open(self._current)
 
     def _rest_of_file(self) -> Iterator[Batch]:
@@ -214,16 +194,13 @@ class Follower:
                 self._begin()
             self._inode = inode
             scanner = Scanner(source)
-            contents: list[bytes] = []
-            size = 0
+            added = bytearray()
             while (content := self._next(source, scanner)) is not None:
-                if content:
-                    contents.append(content)
-                    size += len(content)
-                if size >= _GROUP_BYTES:
-                    yield from self._batch(contents, source)
-                    contents, size = [], 0
-            yield from self._batch(contents, source)
+                added += content
+                if len(added) >= _GROUP_BYTES:
+                    yield from self._batch(bytes(added), source)
+                    added.clear()
+            yield from self._batch(bytes(added), source)
 
     def _next(self, source: Source, scanner: Scanner) -> bytes | None:
         """Return the content of a chunk or messages, b'' for another record, None at the end."""
@@ -241,7 +218,7 @@ class Follower:
         if not known or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
             return self._beyond_damage(source)
         if after > source.size:
-            if self.written and length <= DEFAULT_LIMITS.record_bytes:
+            if self.written and length <= RECORD_BYTES:
                 return None
             return self._beyond_damage(source, sure=False)
         if op in (Opcode.CHUNK, Opcode.MESSAGE):
@@ -267,7 +244,7 @@ class Follower:
             return None
         except LayoutError:
             # The length is trusted if it agrees with the fields of the chunk head.
-            if next(candidates(source, start, start + 1), None) is None:
+            if not has_chunk_at(source, start):
                 return self._beyond_damage(source)
             self.damaged += 1
             self._position = after
@@ -299,8 +276,7 @@ class Follower:
             return
         self.attachments[found.name] = found.data
 
-    def _batch(self, contents: list[bytes], source: Source) -> Iterator[Batch]:
-        content = b''.join(contents)
+    def _batch(self, content: bytes, source: Source) -> Iterator[Batch]:
         if not content:
             return
         try:
@@ -318,7 +294,7 @@ class Follower:
         if self._folder is None or self._current is None:
             return min(1.0, inside)
         if self._current not in self._order:
-            self._order = in_order({*files_in(self._folder), self._current})
+            self._order = in_order({*_files_in(self._folder), self._current})
         begun = self._order.index(self._started) if self._started in self._order else 0
         done = self._order.index(self._current) - begun
         return min(1.0, (done + inside) / max(1, len(self._order) - begun))
@@ -389,8 +365,7 @@ class Picker:
                 _, found = sample_rows(messages, mine, samples)
                 for number in np.unique(found.signal).tolist():
                     keep = found.signal == number
-                    columns = (getattr(found, name)[keep] for name in Rows.__dataclass_fields__)
-                    yield Signal(number), topic, Rows(*columns)
+                    yield Signal(number), topic, Rows(*(column[keep] for column in found))
 
     def _made(self, make: Callable[..., Any], *key: str) -> Any:
         """Return the cached decoder of a definition; None if it cannot be parsed."""

@@ -8,8 +8,10 @@ chunks (from a slow plant) takes no longer than a file of a few large ones.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +29,7 @@ from valveflow_ros.logs.mcap.records import (
 )
 from valveflow_ros.logs.mcap.scan import Chunk, Findings, Scanner
 from valveflow_ros.logs.names import FLOAT64, PLANT_SAMPLE, TopicChoice
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
+from valveflow_ros.logs.source import Source
 from valveflow_ros.records import SIGNALS, ByteArray, FloatArray, IntArray
 
 _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
@@ -35,8 +37,7 @@ _PAYLOAD = np.dtype([('mark', '>u2'), ('options', '<u2'), ('value', '<f8')])
 _SIZES = (12, 16)
 
 
-@dataclass(frozen=True, slots=True)
-class Rows:
+class Rows(NamedTuple):
     """Values found in a group of chunks, in file order.
 
     Arrays of n: ``log_time`` and ``time_ns`` int64, times of reception and of the value in ns;
@@ -52,8 +53,7 @@ class Rows:
     quality: ByteArray
 
 
-@dataclass(frozen=True, slots=True)
-class Group:
+class Group(NamedTuple):
     """Chunks that are read together: their offsets, log times and channels."""
 
     chunks: tuple[int, ...]
@@ -71,14 +71,14 @@ class FileContents:
     findings: Findings
     groups: list[Group] = field(default_factory=list)
     rows: list[Rows] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
-    misfits: dict[int, int] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    misfits: Counter[int] = field(default_factory=Counter)
     announced: int | None = None
 
     @property
     def messages(self) -> int:
         """Number of messages found."""
-        return sum(self.counts.values())
+        return self.counts.total()
 
     @property
     def orphans(self) -> int:
@@ -107,15 +107,9 @@ def float_rows(content: bytes, table: MessageTable, mine: IntArray) -> tuple[Pla
     n = len(picked)
     # Usually all messages of a group are selected, in order.
     cut = slice(None) if n == len(table) else picked
-    found = Rows(
-        table.log_time[cut],
-        table.publish_time[cut],
-        table.channel[cut],
-        np.full(n, -1, dtype=np.int8),
-        value,
-        np.zeros(n, dtype=np.uint8),
-    )
-    return (table.offset[cut], found), wrong
+    unknown, good = np.full(n, -1, dtype=np.int8), np.zeros(n, dtype=np.uint8)
+    times = table.log_time[cut], table.publish_time[cut]
+    return (table.offset[cut], Rows(*times, table.channel[cut], unknown, value, good)), wrong
 
 
 def sample_rows(table: MessageTable, picked: IntArray, samples: Samples) -> Placed:
@@ -125,48 +119,33 @@ def sample_rows(table: MessageTable, picked: IntArray, samples: Samples) -> Plac
     message, signal = np.nonzero(keep)
     source = picked[message]
     return table.offset[source], Rows(
-        table.log_time[source],
-        samples.time_ns[message],
-        table.channel[source],
-        signal.astype(np.int8),
-        samples.values[message, signal],
-        samples.quality[message, signal],
-    )
+        table.log_time[source], samples.time_ns[message], table.channel[source],
+        signal.astype(np.int8), samples.values[message, signal], samples.quality[message, signal],
+    )  # fmt: skip
 
 
-def merged(parts: list[Placed]) -> Rows:
+def _merged(parts: list[Placed]) -> Rows:
     """Merge values of several kinds in file order."""
     if len(parts) == 1:
         return parts[0][1]
     order = np.argsort(np.concatenate([offset for offset, _ in parts]), kind='stable')
-    return Rows(
-        *(
-            np.concatenate([getattr(found, name) for _, found in parts])[order]
-            for name in Rows.__dataclass_fields__
-        )
-    )
+    columns = zip(*(found for _, found in parts), strict=True)
+    return Rows(*(np.concatenate(column)[order] for column in columns))
 
 
 # Larger groups need more memory, smaller ones more calls for the same values.
 GROUP_BYTES = 4 << 20
 
 
-def gather(
-    source: Source,
-    choice: TopicChoice,
-    limits: Limits = DEFAULT_LIMITS,
-) -> FileContents:
+def gather(source: Source, choice: TopicChoice) -> FileContents:
     """Return the contents of one file.
 
-    Raises
-    ------
-    RecordingError
-        If the file contradicts itself or exceeds a limit.
+    Raises `RecordingError` if the file contradicts itself or exceeds a limit.
     """
     summary = read_summary(source)
-    seed = TopicTable(limits) if summary is None else summary.table
+    seed = TopicTable() if summary is None else summary.table
     while True:
-        collector = _Collector(source, choice, seed, Scanner(source, limits))
+        collector = _Collector(source, choice, seed, Scanner(source))
         contents = collector.run()
         if not collector.unnamed & collector.known and not contents.table.replaced:
             break
@@ -182,7 +161,7 @@ class _Collector:
     def __init__(
         self, source: Source, choice: TopicChoice, seed: TopicTable, scanner: Scanner
     ) -> None:
-        self.contents = FileContents(source.path, TopicTable(seed.limits), scanner.findings)
+        self.contents = FileContents(source.path, TopicTable(), scanner.findings)
         self.known: set[int] = set()
         self.unnamed: set[int] = set()
         self._choice = choice
@@ -190,7 +169,11 @@ class _Collector:
         self._heard = 0
         self._floats = np.zeros(1 << 16, dtype=np.bool_)
         self._samples: dict[int, PlantSampleReader] = {}
-        self._take_over(seed)
+        try:
+            self.contents.table.take_over(seed)
+        except LayoutError as error:
+            raise RecordingError(source.path, f'cannot be used: {error}') from None
+        self._learn()
 
     def run(self) -> FileContents:
         for chunks in _grouped(self._scanner.chunks()):
@@ -200,7 +183,11 @@ class _Collector:
             except LayoutError:
                 # One of them is malformed: read them one by one to keep the others.
                 for chunk in chunks:
-                    self._single(chunk)
+                    try:
+                        self._group([chunk])
+                    except LayoutError as error:
+                        why = f'the chunk at byte {chunk.offset}: {error}'
+                        self.contents.findings.add_damage(why)
         self._hear()
         return self.contents
 
@@ -214,12 +201,6 @@ class _Collector:
                 self.contents.findings.add_damage(f'a record outside of the chunks: {error}')
         if new:
             self._learn()
-
-    def _single(self, chunk: Chunk) -> None:
-        try:
-            self._group([chunk])
-        except LayoutError as error:
-            self.contents.findings.add_damage(f'the chunk at byte {chunk.offset}: {error}')
 
     def _group(self, chunks: list[Chunk]) -> None:
         content = b''.join(chunk.content for chunk in chunks)
@@ -238,21 +219,13 @@ class _Collector:
         if not len(table):
             return
         per_channel = np.bincount(table.channel)
-        present = np.flatnonzero(per_channel)
-        counts = per_channel[present]
-        for channel, count in zip(present.tolist(), counts.tolist(), strict=True):
-            self.contents.counts[channel] = self.contents.counts.get(channel, 0) + count
-            if channel not in self.known:
-                self.unnamed.add(channel)
-        self.contents.groups.append(
-            Group(
-                tuple(chunk.offset for chunk in chunks),
-                int(table.log_time.min()),
-                int(table.log_time.max()),
-                frozenset(present.tolist()),
-            )
-        )
-        self._values(content, table, present.tolist())
+        present = np.flatnonzero(per_channel).tolist()
+        self.contents.counts.update({channel: int(per_channel[channel]) for channel in present})
+        self.unnamed |= set(present) - self.known
+        offsets = tuple(chunk.offset for chunk in chunks)
+        times = int(table.log_time.min()), int(table.log_time.max())
+        self.contents.groups.append(Group(offsets, *times, frozenset(present)))
+        self._values(content, table, present)
 
     def _values(self, content: bytes, table: MessageTable, present: list[int]) -> None:
         parts: list[Placed] = []
@@ -260,26 +233,15 @@ class _Collector:
             mine = np.flatnonzero(self._floats[table.channel])
             part, wrong = float_rows(content, table, mine)
             parts.append(part)
-            self._count_misfits(table.channel[wrong])
+            self.contents.misfits.update(table.channel[wrong].tolist())
         for channel in present:
             if channel in self._samples:
                 picked = np.flatnonzero(table.channel == channel)
                 samples = self._samples[channel].read(content, table, picked)
                 parts.append(sample_rows(table, picked, samples))
-                self._count_misfits(table.channel[picked[~samples.good]])
+                self.contents.misfits.update(table.channel[picked[~samples.good]].tolist())
         if parts:
-            self.contents.rows.append(merged(parts))
-
-    def _count_misfits(self, channels: NDArray[np.uint16]) -> None:
-        for channel in channels.tolist():
-            self.contents.misfits[channel] = self.contents.misfits.get(channel, 0) + 1
-
-    def _take_over(self, seed: TopicTable) -> None:
-        try:
-            self.contents.table.take_over(seed)
-        except LayoutError as error:
-            raise RecordingError(self.contents.path, f'cannot be used: {error}') from None
-        self._learn()
+            self.contents.rows.append(_merged(parts))
 
     def _learn(self) -> None:
         table = self.contents.table
@@ -288,9 +250,8 @@ class _Collector:
                 continue
             self.known.add(number)
             type_name = table.type_of(channel)
-            if channel.message_encoding != 'cdr' or not self._choice.may_matter(
-                channel.topic, type_name
-            ):
+            matters = self._choice.may_matter(channel.topic, type_name)
+            if channel.message_encoding != 'cdr' or not matters:
                 continue
             if type_name == FLOAT64:
                 self._floats[number] = True

@@ -19,45 +19,17 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.logs.mcap.chunk_file import (
-    CHUNK_BYTES,
-    ChunkFile,
-    compressor,
-    pack_content,
-)
+from valveflow_ros.logs.mcap import folder
+from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkFile, compressor, pack_content
 from valveflow_ros.logs.mcap.definitions import Definitions
-from valveflow_ros.logs.mcap.folder import (
-    LIBRARY,
-    METADATA_NAME,
-    finish_split,
-    write_metadata,
-)
-from valveflow_ros.logs.mcap.records import RECORD_HEAD
+from valveflow_ros.logs.mcap.records import HEAD_DTYPE, RECORD_HEAD
 from valveflow_ros.logs.mcap.writer import Metadata, TopicRegistry
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import new_file
 from valveflow_ros.logs.source import os_errors
-from valveflow_ros.records import (
-    SIGNALS,
-    IntArray,
-    Readings,
-    SampleTable,
-    Signal,
-    table_to_readings,
-)
+from valveflow_ros.records import SIGNALS, Readings, SampleTable, Signal, table_to_readings
 
-_RECORD = np.dtype(
-    [
-        ('op', 'u1'),
-        ('length', '<u8'),
-        ('channel', '<u2'),
-        ('sequence', '<u4'),
-        ('log_time', '<i8'),
-        ('publish_time', '<i8'),
-        ('mark', '>u4'),
-        ('value', '<f8'),
-    ]
-)
+_RECORD = np.dtype([*HEAD_DTYPE.descr, ('mark', '>u4'), ('value', '<f8')])
 # Little-endian CDR, no options.
 _MARK = 0x00010000
 _PER_CHUNK = CHUNK_BYTES // _RECORD.itemsize
@@ -109,9 +81,11 @@ def write_samples(
         If the file exists or cannot be written.
     """
     optional = [i.signal for i in SIGNALS if np.isfinite(table.column(i.signal)).any()]
+    starts = range(0, len(table), _BLOCK_ROWS)
+    blocks = (table_to_readings(table.part(start, start + _BLOCK_ROWS)) for start in starts)
     return write_readings(
-        _in_blocks(table), optional, path, prefix=prefix, attachments=attachments,
-        metadata=metadata, definitions=definitions, overwrite=overwrite,
+        blocks, optional, path, prefix=prefix, attachments=attachments, metadata=metadata,
+        definitions=definitions, overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -129,15 +103,9 @@ def write_readings(
 ) -> WrittenLog:
     """Write readings block by block; otherwise as `write_samples`.
 
-    Parameters
-    ----------
-    blocks : iterable of Readings
-        In time order, within each block and across blocks.
-    signals : collection of Signal
-        The signals that occur; required signals have a topic in any case.
-    further : sequence of str
-        Topics of further columns, whose readings have the numbers that follow those of the
-        signals.
+    The blocks are in time order, within and across. ``signals`` are those that occur; required
+    signals have a topic in any case. ``further`` are topics of further columns, whose readings
+    have the numbers that follow those of the signals.
     """
     place = Path(path)
     target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'
@@ -154,27 +122,20 @@ def write_readings(
     first = next(parts)
     with os_errors(target, 'cannot be written'):
         with new_file(target) as out:
-            file = ChunkFile(out, LIBRARY)
+            file = ChunkFile(out, folder.LIBRARY)
             file.put_all(attachments or {}, metadata or {})
             packer = compressor()
             for part in chain([first], parts):
                 table = book.packed() if file.table_due(len(book.ids)) else b''
                 offset = len(table) + _RECORD.itemsize * np.arange(len(part), dtype=np.int64)
-                content = table + part.tobytes()
-                file.put_chunk(
-                    pack_content(content, part['channel'], part['log_time'], offset, packer)
-                )
-            split = finish_split(file, target.name, book.table)
-        path = target.parent / METADATA_NAME
+                columns = part['channel'], part['log_time'], offset
+                file.put_chunk(pack_content(table + part.tobytes(), *columns, packer))
+            split = folder.finish_split(file, target.name, book.table)
+        path = target.parent / folder.METADATA_NAME
         # A single file needs no metadata.yaml, so that of another recording is kept.
         if not path.exists() or tells_of(path, target.name):
-            write_metadata(target.parent, [split])
+            folder.write_metadata(target.parent, [split])
     return WrittenLog(target, records.count)
-
-
-def _in_blocks(table: SampleTable) -> Iterator[Readings]:
-    for start in range(0, len(table), _BLOCK_ROWS):
-        yield table_to_readings(table.part(start, start + _BLOCK_ROWS))
 
 
 class _Records:
@@ -193,7 +154,10 @@ class _Records:
         records['op'] = int(Opcode.MESSAGE)
         records['length'] = _RECORD.itemsize - RECORD_HEAD.size
         records['channel'] = self._channels[readings.signal]
-        log_time = strictly_increasing(np.r_[self._last_ns, readings.time_ns])[1:]
+        # Delayed where needed, so that each time is at least 1 ns after the last.
+        steps = np.arange(len(readings) + 1, dtype=np.int64)
+        times = np.r_[self._last_ns, readings.time_ns]
+        log_time = (np.maximum.accumulate(times - steps) + steps)[1:]
         records['log_time'] = log_time
         records['publish_time'] = readings.time_ns
         records['mark'] = _MARK
@@ -224,12 +188,6 @@ def _parts(blocks: Iterable[Readings], records: _Records) -> Iterator[NDArray[np
         yield rest
     if not records.count:
         raise DataError('There are no samples to write.')
-
-
-def strictly_increasing(times: IntArray) -> IntArray:
-    """Return the times, delayed where needed so that each is at least 1 ns after the last."""
-    steps = np.arange(len(times), dtype=np.int64)
-    return np.maximum.accumulate(times - steps) + steps
 
 
 def tells_of(path: Path, name: str) -> bool:

@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
 from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, walk
 from valveflow_ros.logs.mcap.scan import Scanner, scan_warnings, why_empty
 from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, OverBudgetError, Source
+from valveflow_ros.logs.source import OverBudgetError, Source
 from valveflow_ros.records import IntArray, Readings, Signal
 
 _END = np.iinfo(np.int64).max
@@ -27,9 +27,8 @@ _BLOCK = 1 << 14
 MAX_WAITING_BYTES = 96 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class _Batch:
-    """Messages of one group that are not yielded yet."""
+class _Batch(NamedTuple):
+    """Messages of one group that are not yielded yet; ``rows`` are their places in ``table``."""
 
     file: int
     place: int
@@ -37,18 +36,12 @@ class _Batch:
     table: MessageTable
     rows: IntArray
 
-
-def _columns(batch: _Batch) -> tuple[NDArray[np.generic], ...]:
-    table, rows = batch.table, batch.rows
-    starts = table.offset[rows] + HEAD_SIZE
-    return (
-        table.log_time[rows],
-        table.publish_time[rows],
-        table.channel[rows],
-        table.sequence[rows],
-        starts,
-        starts + table.size[rows],
-    )
+    def columns(self) -> tuple[NDArray[np.generic], ...]:
+        """Return times, channel, sequence number, and begin and end in the content."""
+        t, rows = self.table, self.rows
+        starts = t.offset[rows] + HEAD_SIZE
+        heads = (column[rows] for column in (t.log_time, t.publish_time, t.channel, t.sequence))
+        return *heads, starts, starts + t.size[rows]
 
 
 class MessageReader:
@@ -97,18 +90,15 @@ class MessageReader:
     ) -> Iterator[tuple[int, int, LoggedMessage]]:
         """Yield file, sequence number and message of all messages before ``until``, in order."""
         waiting.sort(key=lambda batch: (batch.file, batch.place))
-        due = [batch.table.log_time[batch.rows] < until for batch in waiting]
-        out = [replace(b, rows=b.rows[part]) for b, part in zip(waiting, due, strict=True)]
-        waiting[:] = [
-            replace(batch, rows=batch.rows[~part])
-            for batch, part in zip(waiting, due, strict=True)
-            if not part.all()
-        ]
+        due = [(batch, batch.table.log_time[batch.rows] < until) for batch in waiting]
+        out = [batch._replace(rows=batch.rows[now]) for batch, now in due]
+        waiting[:] = [b._replace(rows=b.rows[~now]) for b, now in due if not now.all()]
         if sum(len(batch.content) for batch in waiting) > MAX_WAITING_BYTES:
             problem = 'holds too much of the same time side by side to be put in order'
             raise RecordingError(self._files[out[0].file].path, problem)
         names = [_channels(self._files[batch.file], None) for batch in out]
-        columns = [np.concatenate(parts) for parts in zip(*map(_columns, out), strict=True)]
+        parts = zip(*(batch.columns() for batch in out), strict=True)
+        columns = [np.concatenate(part) for part in parts]
         sizes = [len(batch.rows) for batch in out]
         columns.append(np.repeat(np.arange(len(out)), sizes))
         # A stable sort keeps messages of equal time in the order of the files.
@@ -148,20 +138,11 @@ def _channels(file: FileContents, topics: Collection[str] | None) -> dict[int, t
     }
 
 
-def read_recording(
-    paths: list[Path],
-    name: str,
-    columns: Mapping[str, str],
-    limits: Limits = DEFAULT_LIMITS,
-) -> LogContents:
+def read_recording(paths: list[Path], name: str, columns: Mapping[str, str]) -> LogContents:
     """Return the joint contents of the files, in this order.
 
-    Raises
-    ------
-    RecordingError
-        If no message can be read.
-    InputError
-        If it is unclear which topic holds a signal.
+    Raises `RecordingError` if no message can be read, and `InputError` if it is unclear which
+    topic holds a signal.
     """
     choice = TopicChoice(columns)
     files: list[FileContents] = []
@@ -169,7 +150,7 @@ def read_recording(
     for path in paths:
         try:
             with Source.open(path) as source:
-                contents = gather(source, choice, limits)
+                contents = gather(source, choice)
             if not contents.messages:
                 raise RecordingError(path, why_empty(contents.findings))
             files.append(contents)
@@ -197,19 +178,12 @@ def read_recording(
     for file in files:
         attachments |= {found.name: found.data for found in file.findings.attachments}
         metadata |= dict(file.findings.metadata)
+    times = min(group.first_ns for group in groups), max(group.last_ns for group in groups)
+    damaged = sum(file.findings.damaged for file in files)
     return LogContents(
-        name,
-        *found,
-        _topics(files, types, chosen),
-        signals,
-        (*warnings, *told),
-        attachments,
-        metadata,
-        min(group.first_ns for group in groups),
-        max(group.last_ns for group in groups),
-        sum(file.findings.damaged for file in files),
-        MessageReader(files).messages,
-    )
+        name, *found, _topics(files, types, chosen), signals, (*warnings, *told), attachments,
+        metadata, *times, damaged, MessageReader(files).messages,
+    )  # fmt: skip
 
 
 def _types(files: list[FileContents], name: str) -> dict[str, str]:
@@ -227,17 +201,14 @@ def _topics(
     files: list[FileContents], types: dict[str, str], chosen: dict[str, Signal]
 ) -> dict[str, TopicInfo]:
     counts = dict.fromkeys(types, 0)
-    definitions = dict.fromkeys(types, '')
-    hashes = dict.fromkeys(types, '')
+    texts: dict[str, tuple[str, str]] = {}
     for file in files:
         for number, channel in file.table.channels.items():
-            counts[channel.topic] += file.counts.get(number, 0)
-            definitions[channel.topic] = file.table.definition_of(channel)
-            hashes[channel.topic] = channel.metadata.get('topic_type_hash', '')
+            counts[channel.topic] += file.counts[number]
+            hash_text = channel.metadata.get('topic_type_hash', '')
+            texts[channel.topic] = file.table.definition_of(channel), hash_text
     return {
-        topic: TopicInfo(
-            topic, kind, counts[topic], chosen.get(topic), definitions[topic], hashes[topic]
-        )
+        topic: TopicInfo(topic, kind, counts[topic], chosen.get(topic), *texts[topic])
         for topic, kind in types.items()
     }
 
@@ -315,24 +286,17 @@ def _readings(files: list[FileContents], chosen: dict[str, Signal]) -> tuple[Rea
     if not parts:
         return Readings.of([]), np.empty(0, dtype=np.int64)
     signal = np.concatenate([signal for _, signal in parts])
-    log_time = np.concatenate([rows.log_time for rows, _ in parts])
-    keep = signal >= 0
-    whole = bool(keep.all())
-    # Files are almost always sorted by log time.
-    sorted_already = bool((log_time[1:] >= log_time[:-1]).all())
-    order = (
-        None
-        if sorted_already
-        else np.argsort(log_time if whole else log_time[keep], kind='stable')
+    log_time, time_ns, value, quality = (
+        np.concatenate([getattr(rows, name) for rows, _ in parts])
+        for name in ('log_time', 'time_ns', 'value', 'quality')
     )
-    columns = [
-        np.concatenate([getattr(rows, field) for rows, _ in parts])
-        for field in ('time_ns', 'value', 'quality')
-    ]
-    everything = (columns[0], signal, columns[1], columns[2], log_time)
-    # Indexing millions of values takes as long as reading them.
-    picked = [column if whole else column[keep] for column in everything]
-    if order is not None:
+    picked = [time_ns, signal, value, quality, log_time]
+    # Indexing millions of values takes as long as reading them, and is hardly ever needed.
+    keep = signal >= 0
+    if not keep.all():
+        picked = [column[keep] for column in picked]
+    if (np.diff(picked[4]) < 0).any():
+        order = np.argsort(picked[4], kind='stable')
         picked = [column[order] for column in picked]
     return Readings(*picked[:4]), picked[4]
 
@@ -345,18 +309,8 @@ def messages_since(
 ) -> Iterator[LoggedMessage]:
     """Yield the messages in a recording's folder logged after ``after_ns``, in order.
 
-    Parameters
-    ----------
-    folder : str or Path
-    after_ns : int
-        Log time in ns since the epoch.
-    definitions : dict, optional
-        Receives the ros2msg text of each topic's type.
-
-    Raises
-    ------
-    RecordingError
-        If the files cannot be read. A folder without files yields nothing.
+    The time is in ns since the epoch. ``definitions`` receives the ros2msg text of each topic's
+    type. Raises `RecordingError` if the files cannot be read; no files yield nothing.
     """
     found = _read(Path(folder), after_ns)
     if definitions is not None:
@@ -374,13 +328,12 @@ def _read(home: Path, after_ns: int) -> LogContents:
             break
         try:
             found = read_recording(wanted, str(home), {})
+            # If one of several files is missing, `read_recording` only warns.
+            if not left or all(path.exists() for path in wanted):
+                return found
         except RecordingError:
             if not left or all(path.exists() for path in wanted):
                 raise
-            continue
-        # If one of several files is missing, `read_recording` only warns.
-        if not left or all(path.exists() for path in wanted):
-            return found
     return LogContents(str(home), Readings.of([]), np.empty(0, dtype=np.int64))
 
 

@@ -87,18 +87,14 @@ class RecorderStatus:
 
     Attributes
     ----------
-    state : RecorderState
-        State of the recorder.
-    reason : str
-        Why it is not recording; empty if it is.
+    state, reason
+        State of the recorder, and why it is not recording; empty if it is.
     file : str
         Name of the current split on disk; empty if none.
     received : int
         Messages passed to the recorder.
-    written : int
-        Of these, messages in complete chunks of existing files.
-    queued : int
-        Of these, messages that wait to be written.
+    written, queued : int
+        Of these, messages in complete chunks of existing files, and that wait to be written.
     lost : int
         Of these, messages that waited when the recorder had to stop, or in files that another
         program removed or changed while they were written, or damaged afterwards.
@@ -108,10 +104,8 @@ class RecorderStatus:
         Of these, messages in finished files deleted since, by ``keep_files`` or another program.
     dropped : dict[str, int]
         Of these, messages refused because too many were waiting or the recorder was closed.
-    files_finished : int
-        Splits finished since the start.
-    bytes_written : int
-        Bytes written since the start.
+    files_finished, bytes_written : int
+        Splits finished and bytes written since the start.
     recovered : tuple of RecoveryReport
         Unfinished files of an earlier recorder that were recovered at the start.
     stalled_s : float
@@ -142,11 +136,9 @@ class RecorderCounters:
     """
 
     def __init__(self, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._dropped_at = -math.inf
+        self._clock, self._limit = clock, limit
         self._lock = threading.Lock()
-        self._limit = limit
-        self._open = True
+        self._open, self._dropped_at = True, -math.inf
         self._now = RecorderStatus(RecorderState.RECORDING)
         self._drops = self._lost_in_files = 0
         self._working_since_s: float | None = None
@@ -207,8 +199,7 @@ class RecorderCounters:
 
     def recovered(self, reports: tuple[RecoveryReport, ...]) -> None:
         """Set the reports of recovered files."""
-        with self._lock:
-            self._now.recovered = reports
+        self._now.recovered = reports
 
     def stopped(self, reason: str = '') -> None:
         """Set the final state; messages that still wait are counted as lost."""
@@ -242,220 +233,6 @@ class NewTopic(NamedTuple):
     type_hash: str
     definition: str
     latched: bool
-
-
-class RecorderLoop:
-    """Runs the writer in a thread; all methods but `start` may be called from other threads."""
-
-    def __init__(
-        self,
-        folder: Path,
-        settings: RecorderSettings,
-        make_writer: Callable[..., RecordingWriter],
-        counters: RecorderCounters,
-        free_bytes: Callable[[Path], int],
-    ) -> None:
-        self._folder = folder
-        self._settings = settings
-        self._make_writer = make_writer
-        self._counters = counters
-        self._free_bytes = free_bytes
-        self._queue: deque[NewTopic | Message] = deque()
-        self._latching: set[str] = set()
-        self._fresh: dict[str, Message] = {}
-        self._latched: dict[str, Message] = {}
-        self._writer: RecordingWriter | None = None
-        self._path: Path | None = None
-        self._begun_at = self._synced_at = self._retry_at = self._looked_at = 0.0
-        self._retry_wait = settings.retry_s
-        self.rotation_asked = False
-        self._stopping = False
-        self._wake = threading.Event()
-        self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def latched(self) -> list[Message]:
-        """Return the latched messages to repeat at the start of a new split."""
-        return list(self._latched.values())
-
-    def put(self, item: NewTopic | Message) -> None:
-        """Queue a topic or a message."""
-        self._queue.append(item)
-        if len(self._queue) >= _WAKE_AT:
-            self._wake.set()
-
-    def wake(self) -> None:
-        """Write waiting messages now, before the flush period ends."""
-        self._wake.set()
-
-    def ask_rotation(self) -> None:
-        """Begin a new split at the next opportunity."""
-        self.rotation_asked = True
-        self._wake.set()
-
-    def stop(self, timeout_s: float) -> None:
-        """Finish the recording and wait at most ``timeout_s`` for it."""
-        self._stopping = True
-        self._wake.set()
-        self._thread.join(timeout_s)
-
-    def _run(self) -> None:
-        try:
-            stopping = False
-            while not stopping:
-                # Read before the cycle, so that messages put before `stop` are still written.
-                stopping = self._stopping
-                begun = time.monotonic()
-                self._cycle(stopping)
-                if not stopping:
-                    self._counters.resting()
-                    # The period counts from the start of the cycle, not from its end.
-                    left = begun + self._settings.flush_period_s - time.monotonic()
-                    self._wake.wait(max(0.0, left))
-                    self._wake.clear()
-            self._counters.stopped(self._finish())
-        except Exception as error:  # noqa: BLE001
-            # Report any error, so that a dead thread is not taken for a running one.
-            self._counters.stopped(f'the recorder failed: {type(error).__name__}: {error}')
-
-    def _cycle(self, stopping: bool) -> None:
-        now = time.monotonic()
-        if now < self._retry_at and not stopping:
-            return
-        try:
-            writer = self._ready()
-            self._counters.working()
-            writer.check()
-            self._check_finished(writer, now)
-            self._check_space(writer)
-            self._drain(writer)
-            self._counters.working()
-            writer.flush()
-            # Only messages already written may be repeated in the next split.
-            self._latched.update(self._fresh)
-            self._fresh = {}
-            self._counters.working()
-            self._sync(writer, now)
-            self._counters.working()
-            self._rotate(writer, now)
-        except RecordingError as error:
-            self._counters.failing(str(error))
-            self._retry_at = time.monotonic() + self._retry_wait
-            self._retry_wait = min(2 * self._retry_wait, self._settings.retry_max_s)
-        else:
-            self._retry_at, self._retry_wait = 0.0, self._settings.retry_s
-            self._counters.healthy()
-        finally:
-            self._count()
-
-    def _ready(self) -> RecordingWriter:
-        if self._writer is None:
-            # Recovering a large file takes long. It must not count as a stall: a watchdog that
-            # ends the node for it would do so again at every start.
-            self._counters.resting()
-            self._counters.recovered(recover_leftovers(self._folder))
-            self._writer = self._make_writer(head_messages=self.latched)
-        return self._writer
-
-    def _check_finished(self, writer: RecordingWriter, now: float) -> None:
-        if now - self._looked_at >= _LOOK_S:
-            self._looked_at = now
-            # A changed file is read again, which may take long and is not a stall.
-            self._counters.resting()
-            writer.check_finished()
-            self._counters.working()
-
-    def _check_space(self, writer: RecordingWriter) -> None:
-        floor = self._settings.free_floor_bytes
-        try:
-            free = self._free_bytes(self._folder)
-        except OSError as error:
-            raise RecordingError(self._folder, f'cannot be asked for space ({error})') from None
-        if free < floor:
-            # Finish the current file while there is still space for its index.
-            if writer.file_bytes:
-                writer.close()
-            problem = f'only {free // MIB} MiB are free, {floor // MIB} MiB must stay free'
-            raise RecordingError(self._folder, problem)
-
-    def _drain(self, writer: RecordingWriter) -> None:
-        for _ in range(len(self._queue)):
-            self._counters.working()
-            item = self._queue.popleft()
-            if isinstance(item, NewTopic):
-                writer.add_topic(
-                    item.topic,
-                    item.type_name,
-                    qos=item.qos,
-                    type_hash=item.type_hash,
-                    definition=item.definition,
-                )
-                if item.latched:
-                    self._latching.add(item.topic)
-                continue
-            if item.topic in self._latching:
-                self._fresh[item.topic] = item
-            writer.write(item.topic, item.data, item.log_time_ns, item.publish_time_ns)
-
-    def _sync(self, writer: RecordingWriter, now: float) -> None:
-        period = self._settings.sync_period_s
-        if period > 0 and now - self._synced_at >= period:
-            writer.sync()
-            self._synced_at = now
-
-    def _rotate(self, writer: RecordingWriter, now: float) -> None:
-        if writer.path != self._path:
-            self._path, self._begun_at = writer.path, now
-        old = now - self._begun_at >= self._settings.rotate_s
-        large = writer.file_bytes >= self._settings.rotate_bytes
-        asked, self.rotation_asked = self.rotation_asked, False
-        if writer.file_bytes and (old or large or asked):
-            writer.rotate()
-            self._remove_old(writer)
-
-    def _remove_old(self, writer: RecordingWriter) -> None:
-        keep = self._settings.keep_files
-        if keep is None:
-            return
-        # Splits of another recording in the same folder are kept.
-        own = [split for split in writer.finished if is_split_of(split.name, writer.name)]
-        for split in own[: max(0, len(own) - keep)]:
-            try:
-                (self._folder / split.name).unlink(missing_ok=True)
-            except OSError as error:
-                problem = f'cannot be removed ({error.strerror})'
-                raise RecordingError(self._folder / split.name, problem) from None
-            writer.forget(split.name)
-
-    def _count(self) -> None:
-        if self._writer is not None:
-            self._counters.on_disk(self._writer)
-
-    def _finish(self) -> str:
-        """Finish the file; return why it could not be finished, empty if it was."""
-        writer = self._writer
-        if writer is None:
-            return 'nothing could be recorded'
-        reason = ''
-        try:
-            writer.note('valveflow_recorder', self._counters.as_metadata())
-            writer.close()
-        except RecordingError as error:
-            writer.abandon()
-            reason = str(error)
-        try:
-            if not writer.check_finished(_LAST_LOOK_BYTES):
-                reason = reason or (
-                    'Files that another program changed were not all read again; '
-                    '`valveflow info` counts what is in them.'
-                )
-        except RecordingError as error:
-            reason = reason or str(error)
-        self._count()
-        return reason
 
 
 def free_bytes_of(folder: Path) -> int:
@@ -507,19 +284,24 @@ class Recorder:
         self._definitions = definitions or Definitions()
         self._topics: dict[str, str] = {}
         self._counters = RecorderCounters(self._settings.queue_limit)
-        make_writer = partial(
-            RecordingWriter,
-            self.folder,
-            name=name,
-            definitions=self._definitions,
-            attachments=attachments,
-            metadata=metadata,
+        self._free_bytes = free_bytes
+        self._queue: deque[NewTopic | Message] = deque()
+        self._latching: set[str] = set()
+        self._fresh: dict[str, Message] = {}
+        self._latched: dict[str, Message] = {}
+        self._make_writer = partial(
+            RecordingWriter, self.folder, name=name, definitions=self._definitions,
+            attachments=attachments, metadata=metadata, head_messages=self._latched.values,
             open_file=open_file,
-        )
-        self._loop = RecorderLoop(
-            self.folder, self._settings, make_writer, self._counters, free_bytes
-        )
-        self._loop.start()
+        )  # fmt: skip
+        self._writer: RecordingWriter | None = None
+        self._path: Path | None = None
+        self._begun_at = self._synced_at = self._retry_at = self._looked_at = 0.0
+        self._retry_wait = self._settings.retry_s
+        self._rotation_asked = self._stopping = False
+        self._wake = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='recorder', daemon=True)
+        self._thread.start()
 
     def add_topic(
         self,
@@ -563,7 +345,7 @@ class Recorder:
             except LayoutError as error:
                 raise RecordingError(f"message type '{type_name}'", str(error)) from None
         self._topics[topic] = type_name
-        self._loop.put(NewTopic(topic, type_name, qos, type_hash, text, latched))
+        self._put(NewTopic(topic, type_name, qos, type_hash, text, latched))
 
     def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
         """Queue a message of raw CDR bytes; never waits for the disk.
@@ -585,7 +367,7 @@ class Recorder:
             raise InputError(f"A message on '{topic}' has an impossible time.")
         if not self._counters.admit(topic):
             return False
-        self._loop.put(Message(topic, data, log_time_ns, publish_time_ns))
+        self._put(Message(topic, data, log_time_ns, publish_time_ns))
         return True
 
     def flush(self, timeout_s: float) -> bool:
@@ -598,7 +380,7 @@ class Recorder:
         """
         received = self.status().received
         until_s = time.monotonic() + timeout_s
-        self._loop.wake()
+        self._wake.set()
         while (status := self.status()).received - status.queued < received:
             if time.monotonic() >= until_s:
                 return False
@@ -607,12 +389,13 @@ class Recorder:
 
     def rotate(self) -> None:
         """Request a new split; returns immediately."""
-        self._loop.ask_rotation()
+        self._rotation_asked = True
+        self._wake.set()
 
     @property
     def is_rotating(self) -> bool:
         """Return True if a requested split has not been begun yet."""
-        return self._loop.rotation_asked
+        return self._rotation_asked
 
     def status(self) -> RecorderStatus:
         """Return all counters at one moment."""
@@ -625,5 +408,159 @@ class Recorder:
         gives the number of messages that still wait.
         """
         self._counters.refuse()
-        self._loop.stop(timeout_s)
+        self._stopping = True
+        self._wake.set()
+        self._thread.join(timeout_s)
         return self._counters.status()
+
+    def _put(self, item: NewTopic | Message) -> None:
+        self._queue.append(item)
+        if len(self._queue) >= _WAKE_AT:
+            self._wake.set()
+
+    # The following methods run in the thread.
+
+    def _run(self) -> None:
+        try:
+            stopping = False
+            while not stopping:
+                # Read before the cycle, so that messages put before `stop` are still written.
+                stopping = self._stopping
+                begun = time.monotonic()
+                self._cycle(stopping)
+                if not stopping:
+                    self._counters.resting()
+                    # The period counts from the start of the cycle, not from its end.
+                    left = begun + self._settings.flush_period_s - time.monotonic()
+                    self._wake.wait(max(0.0, left))
+                    self._wake.clear()
+            self._counters.stopped(self._finish())
+        except Exception as error:  # noqa: BLE001
+            # Report any error, so that a dead thread is not taken for a running one.
+            self._counters.stopped(f'the recorder failed: {type(error).__name__}: {error}')
+
+    def _cycle(self, stopping: bool) -> None:
+        now = time.monotonic()
+        if now < self._retry_at and not stopping:
+            return
+        try:
+            writer = self._ready()
+            self._counters.working()
+            writer.check()
+            if now - self._looked_at >= _LOOK_S:
+                self._looked_at = now
+                # A changed file is read again, which may take long and is not a stall.
+                self._counters.resting()
+                writer.check_finished()
+                self._counters.working()
+            self._check_space(writer)
+            self._drain(writer)
+            self._counters.working()
+            writer.flush()
+            # Only messages already written may be repeated in the next split.
+            self._latched.update(self._fresh)
+            self._fresh = {}
+            self._counters.working()
+            if 0 < self._settings.sync_period_s <= now - self._synced_at:
+                writer.sync()
+                self._synced_at = now
+            self._counters.working()
+            self._rotate(writer, now)
+        except RecordingError as error:
+            self._counters.failing(str(error))
+            self._retry_at = time.monotonic() + self._retry_wait
+            self._retry_wait = min(2 * self._retry_wait, self._settings.retry_max_s)
+        else:
+            self._retry_at, self._retry_wait = 0.0, self._settings.retry_s
+            self._counters.healthy()
+        finally:
+            self._count()
+
+    def _ready(self) -> RecordingWriter:
+        if self._writer is None:
+            # Recovering a large file takes long. It must not count as a stall: a watchdog that
+            # ends the node for it would do so again at every start.
+            self._counters.resting()
+            self._counters.recovered(recover_leftovers(self.folder))
+            self._writer = self._make_writer()
+        return self._writer
+
+    def _check_space(self, writer: RecordingWriter) -> None:
+        floor = self._settings.free_floor_bytes
+        try:
+            free = self._free_bytes(self.folder)
+        except OSError as error:
+            raise RecordingError(self.folder, f'cannot be asked for space ({error})') from None
+        if free < floor:
+            # Finish the current file while there is still space for its index.
+            if writer.file_bytes:
+                writer.close()
+            problem = f'only {free // MIB} MiB are free, {floor // MIB} MiB must stay free'
+            raise RecordingError(self.folder, problem)
+
+    def _drain(self, writer: RecordingWriter) -> None:
+        for _ in range(len(self._queue)):
+            self._counters.working()
+            item = self._queue.popleft()
+            if isinstance(item, NewTopic):
+                topic, type_name, qos, type_hash, definition, latched = item
+                writer.add_topic(
+                    topic, type_name, qos=qos, type_hash=type_hash, definition=definition
+                )
+                if latched:
+                    self._latching.add(topic)
+                continue
+            if item.topic in self._latching:
+                self._fresh[item.topic] = item
+            writer.write(*item)
+
+    def _rotate(self, writer: RecordingWriter, now: float) -> None:
+        if writer.path != self._path:
+            self._path, self._begun_at = writer.path, now
+        old = now - self._begun_at >= self._settings.rotate_s
+        large = writer.file_bytes >= self._settings.rotate_bytes
+        asked, self._rotation_asked = self._rotation_asked, False
+        if writer.file_bytes and (old or large or asked):
+            writer.rotate()
+            self._remove_old(writer)
+
+    def _remove_old(self, writer: RecordingWriter) -> None:
+        keep = self._settings.keep_files
+        if keep is None:
+            return
+        # Splits of another recording in the same folder are kept.
+        own = [split for split in writer.finished if is_split_of(split.name, writer.name)]
+        for split in own[: max(0, len(own) - keep)]:
+            try:
+                (self.folder / split.name).unlink(missing_ok=True)
+            except OSError as error:
+                problem = f'cannot be removed ({error.strerror})'
+                raise RecordingError(self.folder / split.name, problem) from None
+            writer.forget(split.name)
+
+    def _count(self) -> None:
+        if self._writer is not None:
+            self._counters.on_disk(self._writer)
+
+    def _finish(self) -> str:
+        """Finish the file; return why it could not be finished, empty if it was."""
+        writer = self._writer
+        if writer is None:
+            return 'nothing could be recorded'
+        reason = ''
+        try:
+            writer.note('valveflow_recorder', self._counters.as_metadata())
+            writer.close()
+        except RecordingError as error:
+            writer.abandon()
+            reason = str(error)
+        try:
+            if not writer.check_finished(_LAST_LOOK_BYTES):
+                reason = reason or (
+                    'Files that another program changed were not all read again; '
+                    '`valveflow info` counts what is in them.'
+                )
+        except RecordingError as error:
+            reason = reason or str(error)
+        self._count()
+        return reason

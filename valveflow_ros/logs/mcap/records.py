@@ -27,7 +27,7 @@ from mcap.records import Attachment, Channel, Footer, McapRecord, Schema, Statis
 from mcap.well_known import SchemaEncoding
 from numpy.typing import NDArray
 
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Limits, Source
+from valveflow_ros.logs.source import DEFINITION_BYTES, MOST_TOPICS, RECORD_BYTES, Source
 from valveflow_ros.records import IntArray
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -92,31 +92,32 @@ class Unpacker:
         is allocated for the result.
         """
         try:
-            if compression == 'zstd':
-                # The library allocates the size that a frame states, so this size is first
-                # compared with that of the chunk.
-                stated = zstandard.frame_content_size(packed)
-                content = b''
-                if size and stated in (-1, size):
-                    content = bytes(self._decompressor.decompress(packed, max_output_size=size))
-                elif stated not in (-1, size):
-                    raise LayoutError('a chunk unpacks to another size than it claims')
-            elif compression == 'lz4':
-                unpacker = lz4.frame.LZ4FrameDecompressor()
-                content = bytes(unpacker.decompress(packed, max_length=size + 1))
-            elif not compression:
-                content = packed
-            else:
-                raise LayoutError(f"unknown compression '{compression[:16]}'")
+            content = self._unpacked(compression, packed, size)
         except LayoutError:
             raise
         except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
             raise LayoutError(f'a chunk cannot be unpacked ({error})') from None
-        if len(content) != size:
-            if not compression:
-                raise LayoutError('an uncompressed chunk differs from the size it claims')
-            raise LayoutError('a chunk unpacks to another size than it claims')
-        return content
+        if len(content) == size:
+            return content
+        if not compression:
+            raise LayoutError('an uncompressed chunk differs from the size it claims')
+        raise LayoutError('a chunk unpacks to another size than it claims')
+
+    def _unpacked(self, compression: str, packed: bytes, size: int) -> bytes:
+        if compression == 'zstd':
+            # The library allocates the size that a frame states, so this size is first compared
+            # with that of the chunk.
+            stated = zstandard.frame_content_size(packed)
+            if stated not in (-1, size):
+                raise LayoutError('a chunk unpacks to another size than it claims')
+            unpack = self._decompressor.decompress
+            return bytes(unpack(packed, max_output_size=size)) if size else b''
+        if compression == 'lz4':
+            unpacker = lz4.frame.LZ4FrameDecompressor()
+            return bytes(unpacker.decompress(packed, max_length=size + 1))
+        if compression:
+            raise LayoutError(f"unknown compression '{compression[:16]}'")
+        return packed
 
 
 @dataclass(slots=True)
@@ -127,7 +128,6 @@ class TopicTable:
     a checksum differs from them (``replaced``).
     """
 
-    limits: Limits = DEFAULT_LIMITS
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     definition_bytes: int = 0
@@ -140,22 +140,19 @@ class TopicTable:
 
     def add(self, op: int, content: bytes, checked: bool = True) -> None:
         """Add a raw schema or channel record; raises `LayoutError` as `take`, or if malformed."""
-        record = definition(op, content)
-        if record is not None:
+        if record := definition(op, content):
             self.take(record, checked)
 
     def take(self, record: Schema | Channel, checked: bool = True) -> None:
         """Add a schema or a channel.
 
-        Raises
-        ------
-        LayoutError
-            If it contradicts an earlier one, or a limit is exceeded.
+        Raises `LayoutError` if it contradicts an earlier one, or a limit is exceeded.
         """
-        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
-        key = ('schema' if isinstance(record, Schema) else 'channel', record.id)
+        is_schema = isinstance(record, Schema)
+        known: dict[int, Any] = self.schemas if is_schema else self.channels
+        key = ('schema' if is_schema else 'channel', record.id)
         before = known.get(record.id)
-        if before is None or before != record:
+        if before != record:
             if before is not None and (not checked or key not in self.unchecked):
                 raise LayoutError(f'it defines {key[0]} {key[1]} twice, differently')
             self._check_size(len(known) - (before is not None), record)
@@ -168,10 +165,9 @@ class TopicTable:
 
     def take_over(self, other: TopicTable) -> None:
         """Add all records of another table; raises `LayoutError` like `take`."""
-        for number, schema in other.schemas.items():
-            self.take(schema, ('schema', number) not in other.unchecked)
-        for number, channel in other.channels.items():
-            self.take(channel, ('channel', number) not in other.unchecked)
+        for kind, known in (('schema', other.schemas), ('channel', other.channels)):
+            for number, record in known.items():
+                self.take(record, (kind, number) not in other.unchecked)
 
     def type_of(self, channel: Channel) -> str:
         """Return the type of a channel; empty if the file does not state it."""
@@ -188,10 +184,10 @@ class TopicTable:
     def _check_size(self, count: int, record: Schema | Channel) -> None:
         if isinstance(record, Schema):
             self.definition_bytes += len(record.data)
-            if self.definition_bytes > self.limits.definition_bytes:
+            if self.definition_bytes > DEFINITION_BYTES:
                 raise LayoutError('its definitions of messages are larger than can be read')
-        if count >= self.limits.channels:
-            raise LayoutError(f'it has more than {self.limits.channels} topics')
+        if count >= MOST_TOPICS:
+            raise LayoutError(f'it has more than {MOST_TOPICS} topics')
 
 
 def definition(op: int, content: bytes) -> Schema | Channel | None:
@@ -229,7 +225,7 @@ def read_summary(source: Source) -> Summary | None:
     raw_footer = source.read(footer_at, FOOTER_SIZE)
     footer = unpack(Footer.read, raw_footer[RECORD_HEAD.size :])
     size = footer_at - footer.summary_start
-    if footer.summary_start == 0 or not 0 < size <= DEFAULT_LIMITS.record_bytes:
+    if footer.summary_start == 0 or not 0 < size <= RECORD_BYTES:
         return None
     raw = source.read(footer.summary_start, size)
     checked = zlib.crc32(raw_footer[:-4], zlib.crc32(raw)) == footer.summary_crc
@@ -238,14 +234,12 @@ def read_summary(source: Source) -> Summary | None:
     summary, position = Summary(), 0
     try:
         while position < len(raw):
-            op, content = record_at(raw, position)
+            op, content = _record_at(raw, position)
             position += RECORD_HEAD.size + len(content)
             if op == Opcode.STATISTICS:
                 found = unpack(Statistics.read, content)
-                summary.messages, summary.counts = (
-                    found.message_count,
-                    found.channel_message_counts,
-                )
+                summary.messages = found.message_count
+                summary.counts = found.channel_message_counts
                 summary.start_ns, summary.end_ns = found.message_start_time, found.message_end_time
             else:
                 summary.table.add(op, content, checked)
@@ -254,12 +248,9 @@ def read_summary(source: Source) -> Summary | None:
     return summary
 
 
-def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
-    """Return opcode and content of the record at a position; raises `LayoutError`."""
+def _record_at(raw: bytes, position: int) -> tuple[int, bytes]:
     start = position + RECORD_HEAD.size
-    if start > len(raw):
-        raise LayoutError('a record is shorter than what it says it holds')
-    op, length = RECORD_HEAD.unpack_from(raw, position)
+    op, length = RECORD_HEAD.unpack_from(raw, position) if start <= len(raw) else (0, 0)
     if start + length > len(raw):
         raise LayoutError('a record is shorter than what it says it holds')
     return op, raw[start : start + length]
@@ -268,16 +259,10 @@ def record_at(raw: bytes, position: int) -> tuple[int, bytes]:
 # Most chunks of a plant are one run of records of equal size (four Float64 topics: 43 bytes each).
 # Such a run is found in one step; anything else is read record by record.
 HEAD_SIZE = RECORD_HEAD.size + MESSAGE_HEAD.size
-HEAD_DTYPE = np.dtype(
-    [
-        ('op', 'u1'),
-        ('length', '<u8'),
-        ('channel', '<u2'),
-        ('sequence', '<u4'),
-        ('log_time', '<i8'),
-        ('publish_time', '<i8'),
-    ]
-)
+HEAD_DTYPE = np.dtype([
+    ('op', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+    ('log_time', '<i8'), ('publish_time', '<i8'),
+])  # fmt: skip
 RUN_PROBE = 64
 _FEW_BREAKS = 64
 MAX_TOPIC_RECORDS = 1 << 16
@@ -314,47 +299,28 @@ class MessageTable:
 def walk(content: bytes) -> tuple[MessageTable, list[tuple[int, bytes]]]:
     """Return the messages and the schema and channel records of chunk contents.
 
-    Raises
-    ------
-    LayoutError
-        If a record is cut off, or of a kind that is not allowed in a chunk. Opcodes unknown to
-        the format are skipped.
+    Opcodes unknown to the format are skipped. Raises `LayoutError` if a record is cut off, or of
+    a kind that is not allowed in a chunk.
     """
-    starts, others = _boundaries(content)
-    if not len(starts):
-        return _EMPTY, others
+    starts, others, _ = _boundaries(content)
     heads = rows(content, HEAD_DTYPE, 0, starts)
-    table = MessageTable(
-        np.ascontiguousarray(heads['channel']),
-        np.ascontiguousarray(heads['sequence']),
-        np.ascontiguousarray(heads['log_time']),
-        np.ascontiguousarray(heads['publish_time']),
-        starts,
-        heads['length'].astype(np.int64) - MESSAGE_HEAD.size,
+    channel, sequence, log_time, publish_time = (
+        np.ascontiguousarray(heads[name])
+        for name in ('channel', 'sequence', 'log_time', 'publish_time')
     )
-    if table.log_time.min() < 0 or table.publish_time.min() < 0:
+    sizes = heads['length'].astype(np.int64) - MESSAGE_HEAD.size
+    table = MessageTable(channel, sequence, log_time, publish_time, starts, sizes)
+    if len(table) and min(table.log_time.min(), table.publish_time.min()) < 0:
         raise LayoutError('a message claims a time after the year 2262')
     return table, others
 
 
 def leading_messages(content: bytes) -> tuple[int, int]:
     """Return the number of messages at the beginning of ``content``, and where they end."""
-    starts: list[int] = []
-    position, end, probe = 0, len(content), True
-    unpack = RECORD_HEAD.unpack_from
-    while position + HEAD_SIZE <= end:
-        op, length = unpack(content, position)
-        after = position + RECORD_HEAD.size + length
-        if op != 5 or length < MESSAGE_HEAD.size or after > end:
-            break
-        count = _run(content, position, after - position) if probe else 1
-        probe = count >= RUN_PROBE
-        last = position + count * (after - position)
-        starts += range(position, last, after - position)
-        position = last
-    heads = rows(content, HEAD_DTYPE, 0, np.array(starts, dtype=np.int64))
+    starts, _, end = _boundaries(content, leading=True)
+    heads = rows(content, HEAD_DTYPE, 0, starts)
     late = np.flatnonzero((heads['log_time'] < 0) | (heads['publish_time'] < 0))
-    return (int(late[0]), starts[late[0]]) if len(late) else (len(starts), position)
+    return (int(late[0]), int(starts[late[0]])) if len(late) else (len(starts), end)
 
 
 def rows(
@@ -396,17 +362,24 @@ def _evenly(starts: IntArray) -> list[tuple[int, int, int]] | None:
     ]
 
 
-def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
+def _boundaries(
+    content: bytes, leading: bool = False
+) -> tuple[IntArray, list[tuple[int, bytes]], int]:
+    """Return where messages begin, the schema and channel records, and the end.
+
+    If only ``leading`` messages are wanted, the end is before anything else.
+    """
     parts: list[IntArray] = []
     singles: list[int] = []
     others: list[tuple[int, bytes]] = []
     position, end, probe = 0, len(content), True
     unpack = RECORD_HEAD.unpack_from
     while position < end:
-        if end - position < RECORD_HEAD.size:
-            raise LayoutError('a chunk ends in the middle of a record')
-        op, length = unpack(content, position)
+        whole = position + RECORD_HEAD.size <= end
+        op, length = unpack(content, position) if whole else (0, end)
         after = position + RECORD_HEAD.size + length
+        if leading and (op != 5 or length < MESSAGE_HEAD.size or after > end):
+            break
         if after > end:
             raise LayoutError('a chunk ends in the middle of a record')
         if op == 5:
@@ -429,7 +402,7 @@ def _boundaries(content: bytes) -> tuple[IntArray, list[tuple[int, bytes]]]:
         elif op < FIRST_FOREIGN:
             raise LayoutError(f'a chunk holds a record of kind {op}')
         position = after
-    return np.concatenate([*parts, np.array(singles, dtype=np.int64)]), others
+    return np.concatenate([*parts, np.array(singles, dtype=np.int64)]), others, position
 
 
 def _run(content: bytes, position: int, stride: int) -> int:
@@ -450,13 +423,3 @@ def _run(content: bytes, position: int, stride: int) -> int:
             return known + int(same.argmin())
         known, limit = known + taken, 2 * limit
     return count
-
-
-_EMPTY = MessageTable(
-    np.empty(0, dtype=np.uint16),
-    np.empty(0, dtype=np.uint32),
-    np.empty(0, dtype=np.int64),
-    np.empty(0, dtype=np.int64),
-    np.empty(0, dtype=np.int64),
-    np.empty(0, dtype=np.int64),
-)

@@ -14,6 +14,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from mcap.records import Chunk as ChunkRecord
 from mcap.stream_reader import get_chunk_data_stream
 
 from valveflow_ros.errors import RecordingError, counted
+from valveflow_ros.logs.mcap import folder as splits
+from valveflow_ros.logs.mcap import scan
 from valveflow_ros.logs.mcap.chunk_file import (
     CHUNK_BYTES,
     ChunkBuilder,
@@ -35,12 +38,6 @@ from valveflow_ros.logs.mcap.chunk_file import (
     PackedChunk,
     compressor,
     pack_content,
-)
-from valveflow_ros.logs.mcap.folder import (
-    LIBRARY,
-    finish_split,
-    finished_splits,
-    write_metadata,
 )
 from valveflow_ros.logs.mcap.records import (
     RECORD_HEAD,
@@ -51,14 +48,7 @@ from valveflow_ros.logs.mcap.records import (
     read_summary,
     walk,
 )
-from valveflow_ros.logs.mcap.scan import (
-    SHAPE_SIZE,
-    Chunk,
-    Scanner,
-    candidates,
-    scan_warnings,
-    why_empty,
-)
+from valveflow_ros.logs.mcap.scan import Chunk, Scanner
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, new_file, taken
 from valveflow_ros.logs.source import Source, os_errors
 from valveflow_ros.records import IntArray
@@ -85,6 +75,10 @@ class RecoveryReport:
 
 
 Progress = Callable[[int, int], None]
+# What the library raises for a file that it cannot read.
+_UNREADABLE = (
+    McapError, ValueError, KeyError, EOFError, RuntimeError, struct.error, zstandard.ZstdError,
+)  # fmt: skip
 
 
 def recover(
@@ -142,7 +136,7 @@ def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
         parts = sorted(home.glob(f'*.mcap{PART_SUFFIX}'))
         reports = [report for part in parts if (report := _leftover(part)) is not None]
         if reports:
-            write_metadata(home, finished_splits(home).values())
+            splits.write_metadata(home, splits.finished_splits(home).values())
     return tuple(reports)
 
 
@@ -185,18 +179,14 @@ def _holds_nothing(part: Path) -> bool:
         cut_at = scanner.findings.cut_off_at
         if chunks or scanner.findings.damaged:
             return False
-        if cut_at is None or source.size - cut_at < SHAPE_SIZE:
+        if cut_at is None or source.size - cut_at < scan.SHAPE_SIZE:
             return True
         # The fields of this chunk head agree, so the rest of the chunk was never written.
-        return next(candidates(source, cut_at, cut_at + 1), None) is not None
+        return scan.has_chunk_at(source, cut_at)
 
 
 def _recover(
-    path: Path,
-    target: Path,
-    name: str,
-    progress: Progress | None = None,
-    proven: bool = False,
+    path: Path, target: Path, name: str, progress: Progress | None = None, proven: bool = False
 ) -> RecoveryReport:
     with Source.open(path) as source:
         scanner = Scanner(source)
@@ -204,10 +194,13 @@ def _recover(
         chunks = copier.chunks(progress)
         first = next(chunks, None)
         if first is None:
-            why = why_empty(scanner.findings)
+            why = scan.why_empty(scanner.findings)
             raise RecordingError(path, f'{why}; nothing was recovered')
-        with os_errors(target, 'cannot be written'), new_file(target) as out:
-            file = ChunkFile(_Proven(out, path) if proven else out, LIBRARY)
+        kind: Callable[..., PartFile] = PartFile
+        if proven:
+            kind = partial(_ProvenFile, source=path)
+        with os_errors(target, 'cannot be written'), new_file(target, kind) as out:
+            file = ChunkFile(out, splits.LIBRARY)
             for chunk in chain([first], chunks):
                 file.put_chunk(chunk)
             copier.complete()
@@ -216,44 +209,26 @@ def _recover(
             for key, items in scanner.findings.metadata:
                 if key != 'rosbag2':
                     file.put_metadata(key, items)
-            finish_split(file, name, copier.table)
+            splits.finish_split(file, name, copier.table)
         findings = scanner.findings
-        warnings = (*scan_warnings(findings, 'file'), *copier.warnings())
+        warnings = (*scan.scan_warnings(findings, 'file'), *copier.warnings())
     return RecoveryReport(
-        path,
-        target,
-        file.messages,
-        findings.bare_messages,
-        file.chunks,
-        findings.damaged,
-        source.size,
-        file.position,
-        warnings,
-    )
+        path, target, file.messages, findings.bare_messages, file.chunks, findings.damaged,
+        source.size, file.position, warnings,
+    )  # fmt: skip
 
 
-@dataclass
-class _Proven:
-    """A `Writable` that is published only if the library `mcap` can read all of it."""
+class _ProvenFile(PartFile):
+    """A file that is published only if the library `mcap` can read all of it."""
 
-    out: PartFile
-    source: Path
-
-    def __post_init__(self) -> None:
-        self.write, self.sync = self.out.write, self.out.sync
-        self.check, self.check_content = self.out.check, self.out.check_content
-        self.path = self.out.path
-        self.close, self.discard = self.out.close, self.out.discard
-
-    @property
-    def touched(self) -> bool:
-        """Return the state of the wrapped file."""
-        return self.out.touched
+    def __init__(self, path: Path, replace: bool, source: Path) -> None:
+        super().__init__(path, replace)
+        self._source = source
 
     def publish(self) -> None:
         """Read every chunk, then rename the file; raises `RecordingError`."""
         try:
-            with self.out.part.open('rb') as stream:
+            with self.part.open('rb') as stream:
                 summary = make_reader(stream, validate_crcs=True).get_summary()
                 if summary is None:
                     raise McapError('it has no summary')
@@ -265,19 +240,11 @@ class _Proven:
                     )
                     if not index.message_index_offsets.keys() <= summary.channels.keys():
                         raise McapError('its summary does not name all topics')
-        except (
-            McapError,
-            ValueError,
-            KeyError,
-            EOFError,
-            RuntimeError,
-            struct.error,
-            zstandard.ZstdError,
-        ) as error:
+        except _UNREADABLE as error:
             reason = str(error) or type(error).__name__
             problem = f'what is intact in it makes no file that other programs read ({reason})'
-            raise RecordingError(self.source, f'{problem}; nothing was written') from None
-        self.out.publish()
+            raise RecordingError(self._source, f'{problem}; nothing was written') from None
+        super().publish()
 
 
 class _Copier:
@@ -354,7 +321,8 @@ class _Copier:
         messages, others = walk(chunk.content)
         for op, content in others:
             self.table.add(op, content, chunk.checked)
-        here = {(op, _id(content)) for op, content in others}
+        # Each of these records begins with its id.
+        here = {(op, int.from_bytes(content[:2], 'little')) for op, content in others}
         present = np.flatnonzero(np.bincount(messages.channel)).tolist()
         if any(self._records(number) is None for number in present):
             self.complete()
@@ -366,14 +334,11 @@ class _Copier:
             yield ChunkBuilder().build(pack(*missing.values()))
         named = np.isin(messages.channel, list(known))
         self._left_out += len(messages) - int(named.sum())
+        columns = messages.channel, messages.log_time, messages.offset
         if named.all() and not chunk.record:
-            m = messages
-            yield pack_content(chunk.content, m.channel, m.log_time, m.offset, self._packer)
+            yield pack_content(chunk.content, *columns, self._packer)
         elif named.all():
-            yield PackedChunk(
-                chunk.record, messages.channel, messages.log_time, messages.offset,
-                len(chunk.content), chunk.compression,
-            )  # fmt: skip
+            yield PackedChunk(chunk.record, *columns, len(chunk.content), chunk.compression)
         elif named.any():
             yield _rebuilt(chunk.content, messages, np.flatnonzero(named), others)
 
@@ -405,11 +370,6 @@ def _joined(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
             yield chunk
 
 
-def _id(content: bytes) -> int:
-    """Return the id at the start of a schema or channel record."""
-    return int.from_bytes(content[:2], 'little')
-
-
 def _rebuilt(
     content: bytes, messages: MessageTable, kept: IntArray, others: list[tuple[int, bytes]]
 ) -> PackedChunk:
@@ -417,7 +377,8 @@ def _rebuilt(
     builder = ChunkBuilder()
     m = messages
     for k in kept.tolist():
-        sequence, log_ns, publish_ns = m.sequence[k], m.log_time[k], m.publish_time[k]
-        data = m.payload(content, k)
-        builder.add(int(m.channel[k]), int(sequence), int(log_ns), int(publish_ns), data)
+        channel, sequence, log_ns, publish_ns = (
+            int(column[k]) for column in (m.channel, m.sequence, m.log_time, m.publish_time)
+        )
+        builder.add(channel, sequence, log_ns, publish_ns, m.payload(content, k))
     return builder.build(b''.join(RECORD_HEAD.pack(op, len(raw)) + raw for op, raw in others))

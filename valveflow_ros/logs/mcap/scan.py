@@ -26,6 +26,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Chunk as ChunkRecord
 
 from valveflow_ros.errors import counted
+from valveflow_ros.logs import source as limits
 from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES
 from valveflow_ros.logs.mcap.records import (
     FIRST_FOREIGN,
@@ -43,7 +44,7 @@ from valveflow_ros.logs.mcap.records import (
     unpack,
     unpack_attachment,
 )
-from valveflow_ros.logs.source import DEFAULT_LIMITS, Budget, Limits, OverBudgetError, Source
+from valveflow_ros.logs.source import Budget, OverBudgetError, Source
 
 # A chunk record: opcode 6, a length below 64 GiB, four fixed fields, then the
 # name of the compression. `_fields_agree` checks the length.
@@ -64,20 +65,30 @@ def candidates(source: Source, start: int, end: int) -> Iterator[int]:
         window = source.read(start, limit + SHAPE_SIZE)
         match = _SHAPE.search(window)
         while match is not None and match.start() < limit:
-            if _fields_agree(window, match.start(), match.end()):
+            if _fields_agree(window, match):
                 yield start + match.start()
             # Continue at the next byte: a false head may overlap a true one.
             match = _SHAPE.search(window, match.start() + 1)
         start += _WINDOW
 
 
-def _fields_agree(window: bytes, position: int, names_end: int) -> bool:
-    length = RECORD_HEAD.unpack_from(window, position)[1]
-    packed_at = names_end + 8
-    if packed_at > len(window):
+def has_chunk_at(source: Source, position: int) -> bool:
+    """Return True if the fields of a chunk head at a position are consistent."""
+    return next(candidates(source, position, position + 1), None) is not None
+
+
+def _fields_agree(window: bytes, match: re.Match[bytes] | None) -> bool:
+    if match is None or match.end() + 8 > len(window):
         return False
-    packed = int.from_bytes(window[names_end:packed_at], 'little')
-    return bool(packed_at - position - RECORD_HEAD.size + packed == length)
+    length = RECORD_HEAD.unpack_from(window, match.start())[1]
+    packed = int.from_bytes(window[match.end() : match.end() + 8], 'little')
+    return bool(match.end() + 8 - match.start() - RECORD_HEAD.size + packed == length)
+
+
+def _is_chunk_of_another_kind(raw: bytes) -> bool:
+    """Return True if bytes begin a chunk whose opcode is damaged."""
+    chunk = bytes([Opcode.CHUNK]) + raw[1:]
+    return _fields_agree(chunk, _SHAPE.match(chunk))
 
 
 def is_foreign(source: Source, position: int) -> bool:
@@ -89,8 +100,7 @@ def is_foreign(source: Source, position: int) -> bool:
     if len(raw) < RECORD_HEAD.size or raw[0] < FIRST_FOREIGN:
         return False
     _, length = RECORD_HEAD.unpack_from(raw)
-    as_chunk = _SHAPE.match(bytes([Opcode.CHUNK]) + raw[1:])
-    if as_chunk is not None and _fields_agree(raw, 0, as_chunk.end()):
+    if _is_chunk_of_another_kind(raw):
         return False
     try:
         unpack_attachment(source.read(position + RECORD_HEAD.size, min(length, _WINDOW)))
@@ -163,25 +173,21 @@ class Scanner:
         The records found so far outside of chunks, each once.
     """
 
-    def __init__(self, source: Source, limits: Limits = DEFAULT_LIMITS) -> None:
+    def __init__(self, source: Source) -> None:
         self.findings = Findings()
         self.outside: list[Schema | Channel] = []
-        self._outside_table = TopicTable(limits)
+        self._outside_table = TopicTable()
         self._in_summary = False
         self._source = source
-        self._limits = limits
-        self._budget = Budget(source.size, limits)
-        self._attachment_bytes_left = limits.attachment_bytes
+        self._budget = Budget(source.size)
+        self._attachment_bytes_left = limits.ATTACHMENT_BYTES
         self._unpacker = Unpacker()
         self._before = b''
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield the intact chunks, and the runs of messages between them, in file order.
 
-        Raises
-        ------
-        RecordingError
-            Only if the device fails.
+        Raises `RecordingError` only if the device fails.
         """
         try:
             yield from self._follow()
@@ -220,9 +226,8 @@ class Scanner:
                     return position
             op, length, _, inner = _INDEX_HEAD.unpack_from(block, place)
             after = place + RECORD_HEAD.size + length
-            if op != Opcode.MESSAGE_INDEX or inner != length - 6:
-                return position + place
-            if position + after > self._source.size:
+            consistent = op == Opcode.MESSAGE_INDEX and inner == length - 6
+            if not consistent or position + after > self._source.size:
                 return position + place
             place = after
 
@@ -240,11 +245,10 @@ class Scanner:
                 chunk = self._accept(position, length)
             except LayoutError as error:
                 if after <= self._source.size:
-                    self._budget.spend_in_vain(length)
+                    self._budget.spend(length, in_vain=True)
                     problem = f'the chunk at byte {position}: {error}'
                 # The length is trusted if it agrees with the fields of the chunk head.
-                agreed = next(candidates(self._source, position, position + 1), None) is not None
-                if agreed and self._plausible(after):
+                if has_chunk_at(self._source, position) and self._plausible(after):
                     self.findings.add_damage(problem)
                     return None, after
             else:
@@ -269,7 +273,7 @@ class Scanner:
             try:
                 return self._accept(position, length)
             except LayoutError:
-                self._budget.spend_in_vain(length)
+                self._budget.spend(length, in_vain=True)
         return None
 
     def _accept(self, position: int, length: int) -> Chunk:
@@ -279,7 +283,7 @@ class Scanner:
         return chunk
 
     def _chunk(self, position: int, length: int) -> Chunk:
-        if length > self._limits.record_bytes:
+        if length > limits.RECORD_BYTES:
             raise LayoutError(f'its length of {length} bytes is beyond all bounds')
         raw = self._source.read(position, RECORD_HEAD.size + length)
         if len(raw) < RECORD_HEAD.size + length:
@@ -292,11 +296,10 @@ class Scanner:
         # A later version of the format may add fields at the end, but a damaged length must not
         # hide the chunks that follow.
         inner_end = position + RECORD_HEAD.size + exact
-        if exact > length or (
-            exact < length and (self._begins_record(inner_end) or not self._plausible(end))
-        ):
+        hides = exact < length and (self._begins_record(inner_end) or not self._plausible(end))
+        if exact > length or hides:
             raise LayoutError('its length disagrees with its content')
-        if size > self._limits.chunk_bytes:
+        if size > limits.CHUNK_CONTENT_BYTES:
             raise LayoutError(f'it claims to unpack to {size} bytes, which is beyond all bounds')
         self._budget.spend(size)
         content = self._unpacker.unpack(name, found.data, size)
@@ -312,7 +315,7 @@ class Scanner:
 
     def _run(self, position: int, length: int) -> Chunk:
         """Return the messages that start at a position, up to about the size of a chunk."""
-        if length > self._limits.record_bytes:
+        if length > limits.RECORD_BYTES:
             raise LayoutError(f'its length of {length} bytes is beyond all bounds')
         raw = self._source.read(position, max(CHUNK_BYTES, RECORD_HEAD.size + length))
         number, size = leading_messages(raw)
@@ -331,8 +334,7 @@ class Scanner:
             # The header comes first, and the summary has no messages.
             return True
         raw = self._source.read(position, max(SHAPE_SIZE, HEAD_SIZE))
-        as_chunk = _SHAPE.match(bytes([Opcode.CHUNK]) + raw[1:])
-        if as_chunk is not None and _fields_agree(raw, 0, as_chunk.end()):
+        if _is_chunk_of_another_kind(raw):
             return True
         if len(raw) >= HEAD_SIZE:
             # A message index holds a channel, a length, and time and offset of a message.
@@ -342,7 +344,7 @@ class Scanner:
                 first = MESSAGE_HEAD.unpack_from(content, RECORD_HEAD.size)
                 if (channel, log_time) == (first[0], first[2]):
                     return True
-        if length > self._limits.definition_bytes:
+        if length > limits.DEFINITION_BYTES:
             return False
         content = self._source.read(position + RECORD_HEAD.size, length)
         try:
@@ -353,13 +355,13 @@ class Scanner:
     def _inside(self, op: int, position: int, length: int) -> Chunk | None:
         """Process a record other than a chunk; return a chunk that a wrong length would hide."""
         if op == Opcode.MESSAGE:
-            large = length > self._limits.record_bytes
+            large = length > limits.RECORD_BYTES
             why = 'is larger than can be read' if large else 'cannot be one'
             self.findings.add_damage(f'the message at byte {position} {why}')
         if op == Opcode.ATTACHMENT:
             self._attachment(position, length)
             return None
-        if op == Opcode.METADATA and length <= self._limits.definition_bytes:
+        if op == Opcode.METADATA and length <= limits.DEFINITION_BYTES:
             self._metadata(position, length)
         # The summary, which follows, repeats these records with a checksum.
         if op == Opcode.DATA_END and not self._in_summary:
@@ -367,11 +369,13 @@ class Scanner:
             self._data_end(position)
         if op in (Opcode.SCHEMA, Opcode.CHANNEL) and not self._in_summary:
             self._definition(op, position, length)
-        if length < _SMALLEST_CHUNK or (
-            op == Opcode.MESSAGE_INDEX and self._is_index(position, length)
-        ):
-            return None
         start = position + RECORD_HEAD.size
+        if length < _SMALLEST_CHUNK:
+            return None
+        if op == Opcode.MESSAGE_INDEX:
+            inner = int.from_bytes(self._source.read(start + 2, 4), 'little')
+            if inner == length - 6:
+                return None
         return self._seek(start, start + length)
 
     def _data_end(self, position: int) -> None:
@@ -384,25 +388,15 @@ class Scanner:
                 found = zlib.crc32(self._source.read(start, min(_WINDOW, position - start)), found)
             self.findings.whole = found == wanted
 
-    def _is_index(self, position: int, length: int) -> bool:
-        """Return True if a message index agrees with its record length."""
-        raw = self._source.read(position + RECORD_HEAD.size + 2, 4)
-        return int.from_bytes(raw, 'little') == length - 6
-
     def _attachment(self, position: int, length: int) -> None:
-        if length > self._attachment_bytes_left:
-            self.findings.add_damage(
-                f'the attachment at byte {position} is larger than can be read'
-            )
-            return
-        self._attachment_bytes_left -= length
-        content = self._source.read(position + RECORD_HEAD.size, length)
         try:
-            attachment = unpack_attachment(content)
+            if length > self._attachment_bytes_left:
+                raise LayoutError(f'the attachment at byte {position} is larger than can be read')
+            self._attachment_bytes_left -= length
+            content = self._source.read(position + RECORD_HEAD.size, length)
+            self.findings.attachments.append(unpack_attachment(content))
         except LayoutError as error:
             self.findings.add_damage(str(error))
-            return
-        self.findings.attachments.append(attachment)
 
     def _metadata(self, position: int, length: int) -> None:
         content = self._source.read(position + RECORD_HEAD.size, length)
@@ -411,14 +405,14 @@ class Scanner:
         except LayoutError as error:
             self.findings.add_damage(f'the metadata at byte {position}: {error}')
             return
-        if len(self.findings.metadata) < self._limits.channels:
+        if len(self.findings.metadata) < limits.MOST_TOPICS:
             self.findings.metadata.append((found.name, found.metadata))
 
     def _definition(self, op: int, position: int, length: int) -> None:
         """Add a schema or a channel from outside of chunks."""
         kind = 'schema' if op == Opcode.SCHEMA else 'channel'
         try:
-            if length > self._limits.definition_bytes:
+            if length > limits.DEFINITION_BYTES:
                 raise LayoutError('it is larger than can be read')
             record = definition(op, self._source.read(position + RECORD_HEAD.size, length))
             known = self._outside_table
@@ -463,7 +457,7 @@ class Scanner:
         if position + RECORD_HEAD.size + length <= size or op not in _KINDS:
             return False
         # The last chunk of an unfinished file may be cut off, with a consistent head.
-        return next(candidates(self._source, position, position + 1), None) is not None
+        return has_chunk_at(self._source, position)
 
 
 def why_empty(findings: Findings) -> str:
@@ -490,10 +484,9 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
     elif not findings.finished:
         sentences.append(f'The {what} was not finished; everything in it was read.')
     if findings.damaged:
-        places = 'place' if findings.damaged == 1 else 'places'
         sentences.append(
-            f'The {what} is damaged in {findings.damaged} {places}, what stood there was left out '
-            f'({"; ".join(findings.reasons)}).'
+            f'The {what} is damaged in {counted(findings.damaged, "place")}, what stood there was '
+            f'left out ({"; ".join(findings.reasons)}).'
         )
     if findings.over_budget:
         sentences.append(

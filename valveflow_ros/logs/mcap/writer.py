@@ -9,39 +9,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from valveflow_ros.errors import InputError, counted
+from valveflow_ros.logs.mcap import folder as splits
 from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkBuilder, ChunkFile
 from valveflow_ros.logs.mcap.definitions import Definitions, parse_all, type_hash
-from valveflow_ros.logs.mcap.folder import (
-    LIBRARY,
-    METADATA_NAME,
-    Split,
-    finish_split,
-    finished_files,
-    finished_splits,
-    split_number,
-    write_metadata,
-)
+from valveflow_ros.logs.mcap.folder import METADATA_NAME, Split, finished_splits
 from valveflow_ros.logs.mcap.records import LayoutError, TopicTable, pack
 from valveflow_ros.logs.mcap.recover import intact_messages
-from valveflow_ros.logs.part_file import (
-    PART_SUFFIX,
-    AlteredError,
-    PartFile,
-    Writable,
-    make_folder,
-    mark_of,
-)
+from valveflow_ros.logs.part_file import PART_SUFFIX, AlteredError, PartFile, make_folder, mark_of
 from valveflow_ros.logs.source import os_errors
 
 # rosbag2 writes the longest duration of ROS 2 for "no limit".
-_NO_LIMIT = ('sec: 9223372036', 'nsec: 854775807')
+_NO_LIMIT = ':\n    sec: 9223372036\n    nsec: 854775807'
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +39,17 @@ class Qos:
 
     def text(self) -> str:
         """Return this profile as an item of the YAML list in a channel's metadata."""
-        lines = [
-            f'- history: {self.history}',
-            f'  depth: {self.depth}',
-            f'  reliability: {self.reliability}',
-            f'  durability: {self.durability}',
-        ]
-        for name in ('deadline', 'lifespan'):
-            lines += [f'  {name}:', *(f'    {part}' for part in _NO_LIMIT)]
-        lines += ['  liveliness: automatic', '  liveliness_lease_duration:']
-        lines += [f'    {part}' for part in _NO_LIMIT]
-        lines += ['  avoid_ros_namespace_conventions: false']
-        return '\n'.join(lines)
+        return (
+            f'- history: {self.history}\n'
+            f'  depth: {self.depth}\n'
+            f'  reliability: {self.reliability}\n'
+            f'  durability: {self.durability}\n'
+            f'  deadline{_NO_LIMIT}\n'
+            f'  lifespan{_NO_LIMIT}\n'
+            '  liveliness: automatic\n'
+            f'  liveliness_lease_duration{_NO_LIMIT}\n'
+            '  avoid_ros_namespace_conventions: false'
+        )
 
 
 LATCHED = Qos(durability='transient_local', depth=1)
@@ -89,8 +72,8 @@ class TopicRegistry:
         qos: Sequence[Qos] = (Qos(),),
         hash_text: str | None = None,
         definition: str | None = None,
-    ) -> int:
-        """Add a topic and return its channel id; adding it again changes nothing.
+    ) -> None:
+        """Add a topic; adding it again changes nothing.
 
         Raises
         ------
@@ -100,35 +83,26 @@ class TopicRegistry:
             If the definition of the type is not found.
         """
         if topic in self.ids:
-            channel = self.table.channels[self.ids[topic]]
-            if self.table.type_of(channel) != type_name:
-                have = self.table.type_of(channel)
+            have = self.table.type_of(self.table.channels[self.ids[topic]])
+            if have != type_name:
                 raise InputError(f"Topic '{topic}' is recorded as {have}, not as {type_name}.")
-            return self.ids[topic]
+            return
         if type_name not in self._schema_ids:
             text = self.definitions.text(type_name) if definition is None else definition
-            number = len(self._schema_ids) + 1
-            schema = Schema(
+            number = self._schema_ids[type_name] = len(self._schema_ids) + 1
+            self.table.schemas[number] = Schema(
                 id=number, name=type_name, encoding=SchemaEncoding.ROS2, data=text.encode()
             )
-            self._schema_ids[type_name] = schema.id
-            self.table.schemas[schema.id] = schema
         if hash_text is None:
             hash_text = self._hash(type_name, definition)
         offered = '\n'.join(profile.text() for profile in qos)
-        metadata = {'offered_qos_profiles': offered, 'topic_type_hash': hash_text}
-        number = len(self.ids) + 1
-        channel = Channel(
-            id=number,
-            topic=topic,
-            message_encoding=MessageEncoding.CDR,
-            metadata=metadata,
+        number = self.ids[topic] = len(self.ids) + 1
+        self.table.channels[number] = Channel(
+            id=number, topic=topic, message_encoding=MessageEncoding.CDR,
+            metadata={'offered_qos_profiles': offered, 'topic_type_hash': hash_text},
             schema_id=self._schema_ids[type_name],
-        )
-        self.table.channels[number] = channel
-        self.ids[topic] = number
+        )  # fmt: skip
         self._packed = b''
-        return number
 
     def _hash(self, type_name: str, definition: str | None) -> str:
         if definition is None:
@@ -148,7 +122,7 @@ class TopicRegistry:
 
 _SPLITS_APART, _NUMBERS_APART = 64, 1 << 26
 
-OpenFile = Callable[[Path], Writable]
+OpenFile = Callable[[Path], PartFile]
 Metadata = Mapping[str, Mapping[str, str]]
 
 
@@ -201,13 +175,10 @@ class RecordingWriter:
         Splits are named ``NAME_0.mcap``, ...; by default the name of the folder.
     definitions : Definitions, optional
         Source of the message definitions.
-    attachments : mapping of str to bytes
-        Files to attach to every split (parameters, model).
-    metadata : mapping of str to mapping of str to str
-        Metadata records for every split.
+    attachments, metadata : mapping of str
+        Files to attach to every split (parameters, model), and its metadata records.
     head_messages : callable
-        Returns the latched messages that are repeated at the start of every
-        split but the first.
+        Returns the latched messages that are repeated at the start of every split but the first.
     open_file : callable
         Opens a split for writing.
 
@@ -232,10 +203,8 @@ class RecordingWriter:
         self.name = name or self.folder.resolve().name
         self.attachments: dict[str, bytes] = dict(attachments or {})
         self.metadata: dict[str, Mapping[str, str]] = dict(metadata or {})
-        self.lost = self.removed = 0
+        self.lost = self.removed = self.bytes_finished = self.files_finished = 0
         self.loss = ''
-        self.bytes_finished = 0
-        self.files_finished = 0
         self.path: Path | None = None
         self._open_file = open_file
         self._head_messages = head_messages
@@ -243,17 +212,16 @@ class RecordingWriter:
         self._damaged: set[str] = set()
         self._listed: tuple[int, ...] | None = None
         self._at_hand = _File(Path())
-        self._number = -1
-        self._begun = 0
+        self._number, self._begun = -1, 0
         self._topics = TopicRegistry(definitions or Definitions())
         self._builder = ChunkBuilder()
         self._file: ChunkFile | None = None
         self._sequences: dict[int, int] = {}
         self._on_disk: dict[int, int] = {}  # the same, without waiting messages
+        self._list_due = False
         with os_errors(self.folder, 'cannot be written'):
             make_folder(self.folder)
             self._splits = finished_splits(self.folder)
-        self._list_due = False
         # Sequence numbers start elsewhere in a continued folder, because a reader detects
         # repeated messages by them. No split holds enough messages for the ranges to overlap.
         self._before = (self._next_number() % _SPLITS_APART) * _NUMBERS_APART
@@ -329,10 +297,7 @@ class RecordingWriter:
             make_folder(self.folder)
         if self._file is not None:
             with self._writing():
-                try:
-                    self._file.check()
-                except AlteredError as error:
-                    self._give_up(error)
+                self._file.check()
 
     def check_finished(self, most_bytes: int = 64 << 20) -> bool:
         """Check that the finished splits are unchanged, and count the messages that are not there.
@@ -403,12 +368,7 @@ class RecordingWriter:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         """Finish the recording, or leave it unfinished after an error."""
         if kind is None:
             self.close()
@@ -431,11 +391,10 @@ class RecordingWriter:
 
     def _begin(self) -> ChunkFile:
         if self._file is None:
-            number = self._next_number()
-            self.path = self._split_path(number)
+            self.path = self._next_path()
             out = self._open_file(self.path)
             try:
-                file = ChunkFile(out, LIBRARY)
+                file = ChunkFile(out, splits.LIBRARY)
                 file.put_all(self.attachments, self.metadata)
                 if self._begun:
                     self._repeat(file)
@@ -459,15 +418,14 @@ class RecordingWriter:
         if len(head):
             file.put_chunk(head.build(self._topics.packed()))
 
-    def _split_path(self, number: int) -> Path:
-        self._number = number
-        return self.folder / f'{self.name}_{number}.mcap'
-
     def _next_number(self) -> int:
-        parts = self.folder.glob(f'*.mcap{PART_SUFFIX}')
-        found = max(map(split_number, [*finished_files(self.folder), *parts]), default=-1)
+        files = [*splits.finished_files(self.folder), *self.folder.glob(f'*.mcap{PART_SUFFIX}')]
         # Never reuse the number of a removed file: somebody may restore it.
-        return max(found, self._number) + 1
+        return max(map(splits.split_number, files), default=-1) + 1
+
+    def _next_path(self) -> Path:
+        self._number = max(self._next_number(), self._number + 1)
+        return self.folder / f'{self.name}_{self._number}.mcap'
 
     def _finish(self) -> None:
         if self._file is not None and self.path is not None:
@@ -475,30 +433,19 @@ class RecordingWriter:
             self._list_due = True
             if os.path.lexists(self.path):
                 # A file of another program has this name and is kept.
-                self.path = self._at_hand.path = self._split_path(self._next_number())
+                self.path = self._at_hand.path = self._next_path()
                 self._file.rename(self.path)
             with self._writing():
-                try:
-                    split = finish_split(self._file, self.path.name, self._topics.table)
-                except AlteredError as error:
-                    self._give_up(error)
-                else:
-                    self.bytes_finished += self._file.position
-                    self.files_finished += 1
-                    self._splits[split.name] = split
-                    self._at_hand.mark = mark_of(self.path)
-                    self._at_hand = _File(Path())
-                    self._file = self.path = None
+                split = splits.finish_split(self._file, self.path.name, self._topics.table)
+                self.bytes_finished += self._file.position
+                self.files_finished += 1
+                self._splits[split.name] = split
+                self._at_hand.mark = mark_of(self.path)
+                self._at_hand = _File(Path())
+                self._file = self.path = None
         elif not self._list_due:
             return
         self._list()
-
-    def _give_up(self, error: AlteredError) -> None:
-        """Abandon the current split, which another program altered, and count the loss."""
-        file = self._at_hand
-        self.abandon()
-        if file.own:
-            self._recount(file, str(error))
 
     def _recount(self, file: _File, what: str = '') -> None:
         """Count the messages of an earlier split again."""
@@ -540,15 +487,23 @@ class RecordingWriter:
             # A file may have its final name although finishing it failed afterwards.
             found = finished_splits(self.folder, self._splits)
             self._splits = {n: split for n, split in found.items() if n not in self._damaged}
-            write_metadata(self.folder, self._splits.values())
+            splits.write_metadata(self.folder, self._splits.values())
             self._listed = mark_of(self.folder / METADATA_NAME)
         self._list_due = False
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn an `OSError` into a `RecordingError` and abandon the current split."""
+        """Abandon the current split after an `OSError`, which becomes a `RecordingError`.
+
+        If another program altered the split, its loss is counted instead.
+        """
+        file = self._at_hand
         try:
             yield
+        except AlteredError as error:
+            self.abandon()
+            if file.own:
+                self._recount(file, str(error))
         except OSError as error:
             self.abandon()
             with os_errors(self.path or self.folder, 'cannot be written'):

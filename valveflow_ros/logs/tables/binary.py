@@ -12,6 +12,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import reduce
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -50,10 +51,7 @@ _STAMPS = (datetime.date, datetime.time)  # and so datetime.datetime
 def check_parquet(path: Path) -> None:
     """Check that pyarrow, an optional dependency, can be imported.
 
-    Raises
-    ------
-    RecordingError
-        If pyarrow is not installed, or does not work with the installed NumPy.
+    Raises `RecordingError` if it is not installed, or does not work with the installed NumPy.
     """
     try:
         import pyarrow  # noqa: F401
@@ -102,10 +100,8 @@ def parquet_blocks(
 ) -> Iterator[pd.DataFrame]:
     """Yield the columns with these indices block by block.
 
-    Raises
-    ------
-    RecordingError
-        If the unpacked size that the footer states is too large for the size of the file.
+    Raises `RecordingError` if the unpacked size that the footer states is too large for the size
+    of the file.
     """
     import pandas as pd
 
@@ -175,26 +171,22 @@ def _decoded(path: Path, batch: Any) -> list[Any]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    columns = []
-    for column in batch.columns:
-        if pa.types.is_dictionary(column.type):
-            kind = column.type.value_type
-            if not pa.types.is_primitive(kind):
-                lengths = pc.binary_length(column.dictionary).take(column.indices)
-                if (pc.sum(lengths).as_py() or 0) > _TEXT_BYTES:
-                    raise RecordingError(path, 'has texts too long for the cells of a table')
-            column = column.dictionary_decode()
-        columns.append(column)
-    return columns
+    def decoded(column: Any) -> Any:
+        if not pa.types.is_dictionary(column.type):
+            return column
+        if not pa.types.is_primitive(column.type.value_type):
+            lengths = pc.binary_length(column.dictionary).take(column.indices)
+            if (pc.sum(lengths).as_py() or 0) > _TEXT_BYTES:
+                raise RecordingError(path, 'has texts too long for the cells of a table')
+        return column.dictionary_decode()
+
+    return list(map(decoded, batch.columns))
 
 
 def look_at_sheet(path: Path, options: TableOptions, most: int) -> tuple[Any, list[list[str]]]:
     """Return the sheet to read, for `sheet_blocks`, and its first rows as texts.
 
-    Raises
-    ------
-    InputError
-        If the sheet does not exist, or several sheets have a table.
+    Raises `InputError` if the sheet does not exist, or several sheets have a table.
     """
     names: list[str] = []
     tables: list[str] = []
@@ -232,17 +224,13 @@ def look_at_sheet(path: Path, options: TableOptions, most: int) -> tuple[Any, li
 def sheet_blocks(sheet: Any, first_row: int, places: list[int]) -> Iterator[pd.DataFrame]:
     """Yield the cells of these columns of a sheet block by block, from ``first_row`` on."""
     top, left = sheet.start or (0, 0)
-    block: list[list[Any]] = []
-    for number, row in enumerate(sheet.iter_rows(), top):
-        if number < first_row:
-            continue
-        picked = [_plain(row[k - left]) if 0 <= k - left < len(row) else None for k in places]
-        if any(cell is not None for cell in picked):
-            block.append(picked)
-        if len(block) == _SHEET_BLOCK:
-            yield _frame(block)
-            block = []
-    if block:
+    below = itertools.islice(sheet.iter_rows(), max(0, first_row - top), None)
+    rows = (
+        [_plain(row[k - left]) if 0 <= k - left < len(row) else None for k in places]
+        for row in below
+    )
+    filled = (row for row in rows if any(cell is not None for cell in row))
+    while block := list(itertools.islice(filled, _SHEET_BLOCK)):
         yield _frame(block)
 
 
@@ -379,10 +367,7 @@ class _Measure:
 
 def _column(letters: bytes) -> int:
     """Return the number of a column: 1 for A, 0 without letters."""
-    number = 0
-    for letter in letters:
-        number = 26 * number + letter - 64
-    return number
+    return reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
 
 
 def _check_size(path: Path, rows: int, columns: int, size: int) -> None:

@@ -56,18 +56,16 @@ def to_numbers(column: pd.Series[Any], marks: Marks = Marks()) -> Column:
     """Return the float64 values of cells in file order; NaN for cells without a number."""
     import pandas as pd
 
-    if column.dtype.kind in 'iufb' and not hasattr(column.dtype, 'na_value'):
+    kind = column.dtype.kind
+    if kind in 'iufb' and not hasattr(column.dtype, 'na_value'):
         values = column.to_numpy(dtype=np.float64)
         return Column(values, empty=int(np.isnan(values).sum()))
-    if column.dtype.kind == 'M':
-        text = column.astype(str)
-    else:
-        text = column
-        numbers = pd.to_numeric(column, errors='coerce') if marks.thousands != '.' else None
-        if numbers is not None and column.dtype.kind != 'O':
-            values = numbers.to_numpy(dtype=np.float64, na_value=np.nan, copy=True)
-            return _finish(values, text, marks)
-    return _finish(np.full(len(column), np.nan), text, marks)
+    if kind in 'MO' or marks.thousands == '.':
+        text = column.astype(str) if kind == 'M' else column
+        return _finish(np.full(len(column), np.nan), text, marks)
+    numbers = pd.to_numeric(column, errors='coerce')
+    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan, copy=True)
+    return _finish(values, column, marks)
 
 
 def _finish(values: FloatArray, text: pd.Series[Any], marks: Marks) -> Column:
@@ -108,20 +106,16 @@ def _number(text: str, marks: Marks) -> float:
             plain = plain.replace(marks.thousands, '')
     if marks.decimal == ',':
         plain = plain.replace(',', '.')
-    if '_' in plain or not plain.isascii():
-        return float('nan')
     try:
-        value = float(plain)
+        return np.nan if '_' in plain or not plain.isascii() else float(plain)
     except ValueError:
-        return float('nan')
-    return value
+        return np.nan
 
 
 def _is_grouped(text: str, mark: str) -> bool:
     """Return True if a mark separates groups of three digits."""
-    head, *groups = text.lstrip('+-').partition('.')[0].split(mark)
-    if mark == '.':
-        head, *groups = text.lstrip('+-').split(mark)
+    whole = text.lstrip('+-')
+    head, *groups = (whole if mark == '.' else whole.partition('.')[0]).split(mark)
     digits = 1 <= len(head) <= 3 and head.isdecimal()
     return digits and bool(groups) and all(len(g) == 3 and g.isdecimal() for g in groups)
 
@@ -157,12 +151,8 @@ _OPC_GOOD, _OPC_UNCERTAIN = 192, 64
 def quality_column(name: str, names: tuple[str, ...]) -> int | None:
     """Return the index of the quality column of the column ``name``; None if there is none."""
     own = folded(split_unit(name)[0])
-    for place, other in enumerate(names):
-        text = folded(other)
-        for ending in _ENDINGS:
-            if text in (f'{own} {ending}', f'{ending} {own}', f'{own}{ending}'):
-                return place
-    return None
+    wanted = {text for e in _ENDINGS for text in (f'{own} {e}', f'{e} {own}', f'{own}{e}')}
+    return next((place for place, other in enumerate(names) if folded(other) in wanted), None)
 
 
 def quality_columns(names: tuple[str, ...]) -> set[int]:

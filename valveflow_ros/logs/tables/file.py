@@ -95,10 +95,7 @@ class TableFile:
     def samples(self, *places: int) -> list[tuple[str, ...]]:
         """Return the cells of these columns in some rows, without rows that are too short.
 
-        Raises
-        ------
-        RecordingError
-            If the file cannot be read.
+        Raises `RecordingError` if the file cannot be read.
         """
         if self.rows is None:
             with _translated(self.path):
@@ -110,30 +107,24 @@ class TableFile:
     def blocks(self, places: Sequence[int]) -> Iterator[pd.DataFrame]:
         """Yield the columns with these indices block by block, named by their index.
 
-        Raises
-        ------
-        RecordingError
-            If the file cannot be read, or has no rows.
+        Raises `RecordingError` if the file cannot be read, or has no rows.
         """
         wanted = sorted(set(places))
+        if self.separator:
+            frames = self._text_frames(wanted)
+        elif self.sheet is not None:
+            frames = sheet_blocks(self.sheet, self.heading.below, wanted)
+        else:
+            frames = parquet_blocks(self.path, wanted, self.options)
         with _translated(self.path):
             any_row = False
-            for frame in self._frames(wanted):
+            for frame in frames:
                 if len(frame):
                     any_row = True
                     frame.columns = wanted
                     yield frame
             if not any_row:
                 raise RecordingError(self.path, 'is a table without rows')
-
-    def _frames(self, places: list[int]) -> Iterator[pd.DataFrame]:
-        if not self.separator:
-            if self.sheet is not None:
-                yield from sheet_blocks(self.sheet, self.heading.below, places)
-            else:
-                yield from parquet_blocks(self.path, places, self.options)
-            return
-        yield from self._text_frames(places)
 
     def _text_frames(self, places: list[int]) -> Iterator[pd.DataFrame]:
         import pandas as pd
@@ -143,22 +134,14 @@ class TableFile:
             with warnings.catch_warnings():
                 # pandas 4 has only the exact parser and warns about this argument.
                 warnings.simplefilter('ignore', DeprecationWarning)
+                # The default parser does not always return the nearest double.
                 frames = pd.read_csv(
                     Lines(self.path, source.stream, self.encoding, self.separator),
-                    sep=self.separator,
-                    decimal=marks.decimal,
-                    header=0,
-                    skiprows=list(self.skip),
-                    usecols=places,
-                    # The default parser does not always return the nearest double.
-                    float_precision='round_trip',
-                    keep_default_na=False,
-                    na_values=[''],
-                    skipinitialspace=True,
-                    index_col=False,
-                    low_memory=False,
+                    sep=self.separator, decimal=marks.decimal, header=0, skiprows=list(self.skip),
+                    usecols=places, float_precision='round_trip', keep_default_na=False,
+                    na_values=[''], skipinitialspace=True, index_col=False, low_memory=False,
                     chunksize=BLOCK_ROWS,
-                )
+                )  # fmt: skip
             for frame in frames:
                 self.share = min(1.0, source.stream.tell() / source.size)
                 yield frame
@@ -167,10 +150,7 @@ class TableFile:
 def look_at(path: Path, options: TableOptions = AS_SEEN) -> TableFile:
     """Determine the kind of a table, its columns and the format of its numbers.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read as a table.
+    Raises `RecordingError` if the file cannot be read as a table.
     """
     with Source.open(path) as source:
         head = source.read(0, _HEAD_BYTES)
@@ -235,10 +215,8 @@ def _peeks(source: Source, encoding: str, separator: str, start: int) -> list[li
 
 
 def _marks(rows: list[list[str]], separator: str, options: TableOptions) -> Marks | None:
-    if options.decimal == 'comma':
-        return Marks(',', '.')
-    if options.decimal == 'point':
-        return Marks('.', ',')
+    if options.decimal:
+        return Marks(',', '.') if options.decimal == 'comma' else Marks('.', ',')
     found = decimal_mark([cell for row in rows for cell in row], separator)
     if found is None:
         return None
@@ -275,8 +253,8 @@ def heading(rows: list[list[str]]) -> Heading:
     first = next((k for k, row in enumerate(rows) if _is_data(row, least)), None)
     filled = [k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
     if first is None:
-        at = _first_full(rows, filled) if filled else 0
-        return _heading(rows, at, ())
+        wide = max((_full_cells(rows[k]) for k in filled[:_LOOK]), default=0)
+        return _heading(rows, next((k for k in filled if _full_cells(rows[k]) >= min(2, wide)), 0))
     width = len(rows[first])
     above = [k for k in filled if k < first]
     # Only rows directly above the data and about as wide belong to the heading.
@@ -286,7 +264,7 @@ def heading(rows: list[list[str]]) -> Heading:
             break
         block.insert(0, k)
     if not block:
-        return _heading(rows, above[-1] if above else filled[0], ())
+        return _heading(rows, above[-1] if above else filled[0])
     named = [k for k in block if not _are_units(rows[k])] or block
     most = max(_full_cells(rows[k]) for k in named)
     at = next(k for k in named if _full_cells(rows[k]) >= 0.8 * most)
@@ -313,12 +291,7 @@ def _full_cells(row: list[str]) -> int:
     return sum(bool(cell.strip()) for cell in row)
 
 
-def _first_full(rows: list[list[str]], filled: list[int]) -> int:
-    wide = max(_full_cells(rows[k]) for k in filled[:_LOOK])
-    return next(k for k in filled if _full_cells(rows[k]) >= min(2, wide))
-
-
-def _heading(rows: list[list[str]], at: int, others: tuple[int, ...]) -> Heading:
+def _heading(rows: list[list[str]], at: int, others: tuple[int, ...] = ()) -> Heading:
     names = [cell.strip() for cell in rows[at]] if rows else []
     units = [split_unit(name)[1] for name in names]
     about = [''] * len(names)

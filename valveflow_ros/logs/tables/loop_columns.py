@@ -19,13 +19,8 @@ from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.logs.tables.cells import Marks, to_numbers
 from valveflow_ros.logs.tables.file import TableFile, look_at
 from valveflow_ros.logs.tables.match import TIME, Matcher, stamps_in, time_columns, zone_in
-from valveflow_ros.logs.tables.refusal import (
-    AS_SEEN,
-    THEIRS,
-    RefusedError,
-    Remedy,
-    TableOptions,
-)
+from valveflow_ros.logs.tables.reader import cells_of, time_cells, time_samples
+from valveflow_ros.logs.tables.refusal import AS_SEEN, THEIRS, RefusedError, Remedy, TableOptions
 from valveflow_ros.logs.tables.times import NEVER, RowClock, TimeReader
 from valveflow_ros.logs.tables.words import folded, split_unit
 from valveflow_ros.records import FloatArray, IntArray
@@ -56,14 +51,8 @@ _TAG = {
 class LoopColumns:
     """Columns of a loop in a table, with rows in time order.
 
-    Attributes
-    ----------
-    time_ns : int64 (n,)
-        Times in ns since 1970, strictly increasing.
-    columns : dict of str to float64 (n,)
-        Values by role; NaN for cells without a number.
-    names : dict of str to str
-        Names in the table by role.
+    ``time_ns`` is int64 (n,) in ns since 1970, strictly increasing. ``columns`` gives the values
+    by role, float64 (n,), NaN for cells without a number, ``names`` the names in the table.
     """
 
     time_ns: IntArray
@@ -105,7 +94,11 @@ def read_loop_columns(
     if time is None:
         time_ns = RowClock(options).at(0, len(frame))
     else:
-        time_ns = _times(file, frame, time, date, options)
+        name = file.names[time]
+        samples = time_samples(file, time, date)
+        reader = TimeReader(samples, str(path), name, options, zone_in(name))
+        time_ns = reader.read(time_cells(frame, time, date))
+        reader.finish()
     values = {r: to_numbers(frame[k], file.marks or Marks()).values for r, k in chosen.items()}
     return ordered(time_ns, values, {r: file.names[k] for r, k in chosen.items()})
 
@@ -115,10 +108,7 @@ def ordered(
 ) -> LoopColumns:
     """Return columns in time order, with the first row of each time.
 
-    Raises
-    ------
-    DataError
-        If no row has a time.
+    Raises `DataError` if no row has a time.
     """
     rows = np.flatnonzero(time_ns != NEVER)
     if not len(rows):
@@ -209,7 +199,7 @@ def _time_places(
     if time is None and date is not None:
         return date, None
     if time is None:
-        time = next((k for k in range(len(file.names)) if stamps_in(_cells(file, k))), None)
+        time = next((k for k in range(len(file.names)) if stamps_in(cells_of(file, k))), None)
     if time is None and not options.period:
         raise RefusedError(
             file.path,
@@ -217,29 +207,6 @@ def _time_places(
             '--period, such as --period 10s',
             [Remedy('period', '10s')],
         )
-    clock = (
-        [c for c in _cells(file, time) if ':' in c and len(c) <= 15] if time is not None else []
-    )
-    apart = bool(clock) and date != time
+    cells = cells_of(file, time) if time is not None else []
+    apart = date != time and any(':' in cell and len(cell) <= 15 for cell in cells)
     return time, (date if apart else None)
-
-
-def _cells(file: TableFile, place: int) -> list[str]:
-    return [cell for (cell,) in file.samples(place) if cell]
-
-
-def _times(
-    file: TableFile, frame: object, time: int, date: int | None, options: TableOptions
-) -> IntArray:
-    import pandas as pd
-
-    assert isinstance(frame, pd.DataFrame)
-    name, column, samples = file.names[time], frame[time], _cells(file, time)
-    if date is not None:
-        samples = [f'{d[:11].strip()} {t}' for d, t in file.samples(date, time)]
-        days = frame[date].astype('string').str.strip().str.slice(0, 11)
-        column = days.str.strip() + ' ' + column.astype('string').str.strip()
-    reader = TimeReader(samples, str(file.path), name, options, zone_in(name))
-    time_ns = reader.read(column)
-    reader.finish()
-    return time_ns

@@ -12,23 +12,10 @@ from pathlib import Path
 from types import MappingProxyType
 
 from valveflow_ros.errors import InputError
+from valveflow_ros.logs.tables import words
 from valveflow_ros.logs.tables.file import Heading
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
-from valveflow_ros.logs.tables.words import (
-    CLEAR,
-    DIMENSIONS,
-    EXACT,
-    LIKELY,
-    TAG,
-    Spelling,
-    flow_spelled,
-    folded,
-    is_foreign,
-    marks,
-    of_gauge,
-    spelling,
-    split_unit,
-)
+from valveflow_ros.logs.tables.words import EXACT, Spelling, folded, split_unit
 from valveflow_ros.records import SIGNALS, Signal
 
 TIME, DATE = 'time', 'date'
@@ -50,7 +37,9 @@ _LOCAL = {
 }  # fmt: skip
 _PERIOD = '60s'
 _USUAL_DEGC = 540
-_GROUNDS = {EXACT: '', CLEAR: 'by its name', LIKELY: 'by its name', TAG: 'by its tag'}
+_GROUNDS = {
+    EXACT: '', words.CLEAR: 'by its name', words.LIKELY: 'by its name', words.TAG: 'by its tag'
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +75,11 @@ class Matcher:
     def find(self, theirs: str) -> int | None:
         """Return the column with this name, with or without its unit; None if there is none.
 
-        Raises
-        ------
-        InputError
-            If several columns have this name.
+        Raises `InputError` if several columns have this name.
         """
         wanted = theirs.strip()
         same = [k for k, name in enumerate(self.names) if name == wanted]
-        if not same:
-            same = [k for k, name in enumerate(self.names) if split_unit(name)[0] == wanted]
+        same = same or [k for k, n in enumerate(self.names) if split_unit(n)[0] == wanted]
         if len(same) > 1:
             raise InputError(f"{self.path}: there are several {self.what}s called '{wanted}'.")
         return same[0] if same else None
@@ -117,7 +102,7 @@ class Matcher:
             else:
                 unit = self.unit_of(place)
                 if signal == Signal.GENERATED_POWER:
-                    unit = unit or flow_spelled(self._units[place])
+                    unit = unit or words.flow_spelled(self._units[place])
                 chosen[signal] = Chosen(place, self.names[place], unit)
         marked = self._marked({c.place for c in chosen.values()})
         several: list[str] = []
@@ -153,12 +138,9 @@ class Matcher:
         return chosen
 
     def _propose(
-        self,
-        missing: list[str],
-        several: list[str],
-        remedies: list[Remedy],
+        self, missing: list[str], several: list[str], remedies: list[Remedy],
         chosen: Mapping[Signal, Chosen],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Propose a column for a missing signal if it is the only one left in a suitable unit."""
         for info in SIGNALS:
             only = self._only_in_unit_of(info.signal, chosen) if info.topic in missing else None
@@ -176,19 +158,14 @@ class Matcher:
         found = [
             name for k, name in enumerate(self.names)
             if k not in taken and name and (unit := self.unit_of(k)) is not None
-            and unit.dimension == DIMENSIONS[signal]
+            and unit.dimension == words.DIMENSIONS[signal]
         ]  # fmt: skip
         return found[0] if len(found) == 1 else None
 
     def _refusal(
-        self,
-        absent: Mapping[Signal, str],
-        several: list[str],
-        missing: list[str],
-        remedies: list[Remedy],
-        no_time: bool,
-        chosen: Mapping[Signal, Chosen],
-    ) -> RefusedError:
+        self, absent: Mapping[Signal, str], several: list[str], missing: list[str],
+        remedies: list[Remedy], no_time: bool, chosen: Mapping[Signal, Chosen],
+    ) -> RefusedError:  # fmt: skip
         """Return one error for everything that could not be decided."""
         times = [TIME] if no_time else []
         topics = [SIGNALS[s].topic for s in absent] + missing + times
@@ -229,17 +206,18 @@ class Matcher:
         """Return the unit of a column in the file; None if absent or unknown."""
         if not self._units[place]:
             return None
-        return of_gauge(spelling(self._units[place]), f'{self.names[place]} {self._about[place]}')
+        told = f'{self.names[place]} {self._about[place]}'
+        return words.of_gauge(words.spelling(self._units[place]), told)
 
     def _marked(self, used: Collection[int]) -> list[dict[Signal, float]]:
         found: list[dict[Signal, float]] = []
         for place, name in enumerate(self.names):
-            foreign = is_foreign(self._units[place])
+            foreign = words.is_foreign(self._units[place])
             if place in self._taken or place in used or not name or foreign:
                 found.append({})
                 continue
             bare = split_unit(name)[0]
-            everything = marks(bare, self._about[place], self.unit_of(place))
+            everything = words.marks(bare, self._about[place], self.unit_of(place))
             # A column is one signal only, so only its best marks are kept.
             most = max(everything.values(), default=0.0)
             found.append({s: m for s, m in everything.items() if m == most})

@@ -13,17 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from valveflow_ros.logs.names import signal_of, signals_of
-from valveflow_ros.logs.tables.cells import (
-    QUALITY_SUFFIX,
-    Marks,
-    foreign_quality,
-    quality_column,
-    quality_columns,
-    to_numbers,
-    to_quality,
-    understands,
-)
+from valveflow_ros.logs.names import signal_of
+from valveflow_ros.logs.tables import cells as cell_values
+from valveflow_ros.logs.tables.cells import Marks, to_numbers, understands
 from valveflow_ros.logs.tables.file import Heading, TableFile, look_at
 from valveflow_ros.logs.tables.match import (
     DATE,
@@ -69,9 +61,15 @@ class RawBlock:
     """Some rows in file order, as in `RawTable`, without rows whose time is unknown."""
 
     time_ns: IntArray
-    columns: dict[str, FloatArray]
-    quality: dict[str, ByteArray]
+    columns: dict[str, FloatArray] = field(default_factory=dict)
+    quality: dict[str, ByteArray] = field(default_factory=dict)
     present: dict[str, BoolArray] = field(default_factory=dict)
+
+    def at(self, rows: Any) -> RawBlock:
+        """Return the rows with these indices, or where a mask is True."""
+        parts = (self.columns, self.quality, self.present)
+        picked = [{name: values[rows] for name, values in part.items()} for part in parts]
+        return RawBlock(self.time_ns[rows], *picked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +107,28 @@ class LongForm:
         return Heading(0, (), tuple(found), units, tuple(about for _, about in found.values()))
 
 
-class TableReader:
-    """A table whose columns are assigned to signals.
+def cells_of(file: TableFile, place: int) -> list[str]:
+    """Return the cells of a column in the sampled rows that are not empty."""
+    return [cell for (cell,) in file.samples(place) if cell]
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    columns, absent, options
-        As in `read_table`.
+
+def time_samples(file: TableFile, time: int, date: int | None) -> list[str]:
+    """Return the times in the sampled rows, with their date if that stands in another column."""
+    if date is None:
+        return cells_of(file, time)
+    return [f'{day[:11].strip()} {clock}' for day, clock in file.samples(date, time)]
+
+
+def time_cells(frame: pd.DataFrame, time: int, date: int | None) -> pd.Series[Any]:
+    """Return the times of a block in the same form."""
+    if date is None:
+        return frame[time]
+    days = frame[date].astype('string').str.strip().str.slice(0, 11)
+    return days.str.strip() + ' ' + frame[time].astype('string').str.strip()
+
+
+class TableReader:
+    """A table whose columns are assigned to signals; arguments and errors as in `read_table`.
 
     Attributes
     ----------
@@ -130,20 +141,12 @@ class TableReader:
         all blocks were read.
     bad_times : int
         Number of rows without a readable time. Complete when all blocks were read.
-
-    Raises
-    ------
-    RecordingError, InputError
-        As in `read_table`.
     """
 
     def __init__(
-        self,
-        path: Path,
-        columns: Mapping[str, str],
-        absent: Collection[str] = (),
+        self, path: Path, columns: Mapping[str, str], absent: Collection[str] = (),
         options: TableOptions = AS_SEEN,
-    ) -> None:
+    ) -> None:  # fmt: skip
         wanted = dict(columns)
         times = {name: wanted.pop(name) for name in (TIME, DATE) if name in wanted}
         by_signal = {signal_of(name): theirs for name, theirs in wanted.items()}
@@ -157,9 +160,12 @@ class TableReader:
             matcher = Matcher(path, self.long.tags(self._file), 'tag')
         else:
             heading = self._file.heading
-            matcher = Matcher(path, heading, taken=quality_columns(heading.names) | taken)
+            matcher = Matcher(
+                path, heading, taken=cell_values.quality_columns(heading.names) | taken
+            )
         counted = bool(options.period) and self.long is None
-        found = matcher.match(by_signal, signals_of(absent), no_time=time is None and not counted)
+        spared = {signal_of(name) for name in absent}
+        found = matcher.match(by_signal, spared, no_time=time is None and not counted)
         self._time = time
         self._chosen: dict[str, Chosen] = {SIGNALS[s].column: found[s] for s in sorted(found)}
         self._quality = {} if self.long is not None else self._quality_places()
@@ -214,7 +220,7 @@ class TableReader:
                 if tag in cells:
                     cells[tag].append(cell)
         else:
-            cells = {name: self._cells(heading.names.index(name)) for name in cells}
+            cells = {name: cells_of(self._file, heading.names.index(name)) for name in cells}
         return [name for name, texts in cells.items() if self._vary(texts)]
 
     def _vary(self, texts: list[str]) -> bool:
@@ -235,12 +241,12 @@ class TableReader:
         long, coded = self.long, False
         if long is not None:
             places += [k for k in (long.tag, long.value, long.quality) if k >= 0]
-            coded = long.quality >= 0 and understands(self._cells(long.quality))
+            coded = long.quality >= 0 and understands(cells_of(self._file, long.quality))
         else:
             places += [c.place for c in self._chosen.values()] + list(self._quality.values())
         for frame in self._file.blocks(places):
             time_ns = self._read_times(frame)
-            block = RawBlock(time_ns, {}, {})
+            block = RawBlock(time_ns)
             if long is not None:
                 self._read_long(frame, long, coded, block)
             else:
@@ -250,24 +256,12 @@ class TableReader:
             if block.present:
                 keep &= np.any(list(block.present.values()), axis=0)
             if keep.any():
-                yield (
-                    block
-                    if keep.all()
-                    else RawBlock(
-                        time_ns[keep],
-                        {name: column[keep] for name, column in block.columns.items()},
-                        {name: codes[keep] for name, codes in block.quality.items()},
-                        {name: there[keep] for name, there in block.present.items()},
-                    )
-                )
+                yield block if keep.all() else block.at(keep)
 
     def notes(self) -> list[str]:
         """Return sentences about the data, after all blocks were read.
 
-        Raises
-        ------
-        InputError
-            As `TimeReader.finish`, for example if no row has a time.
+        Raises `InputError` as `TimeReader.finish`, for example if no row has a time.
         """
         notes = [*self._file.notes, *self._clock.finish()]
         for name, theirs in self.names.items():
@@ -324,7 +318,7 @@ class TableReader:
         # Raises if two columns have this name.
         matcher.find(self._file.names[time])
         # A separate date is used only if the time column holds times of day.
-        cells = self._cells(time)
+        cells = cells_of(self._file, time)
         clock = sum(c.count(':') >= 1 and not any(m in c for m in '-/T') and len(c) <= 15
                     and c.find('.') not in range(5) for c in cells)  # fmt: skip
         return time, (date if date != time and 2 * clock > len(cells) else None)
@@ -332,11 +326,7 @@ class TableReader:
     def _index_of_times(self) -> int | None:
         """Return the unnamed column that holds times, as pandas writes an index."""
         places = (k for k, name in enumerate(self._file.names) if name in NAMES_OF_AN_INDEX)
-        return next((k for k in places if stamps_in(self._cells(k))), None)
-
-    def _cells(self, place: int) -> list[str]:
-        """Return the non-empty cells of a column in the sampled rows."""
-        return [cell for (cell,) in self._file.samples(place) if cell]
+        return next((k for k in places if stamps_in(cells_of(self._file, k))), None)
 
     def _long_form(self, by_signal: Mapping[Signal, str]) -> LongForm | None:
         form = LongForm.of(self._file.heading)
@@ -350,12 +340,14 @@ class TableReader:
         names, places = self._file.names, {}
         used = {c.place for c in self._chosen.values()}
         for name, chosen in self._chosen.items():
-            own = f'{name}{QUALITY_SUFFIX}'
+            own = f'{name}{cell_values.QUALITY_SUFFIX}'
             if chosen.theirs == name and own in names:
                 places[name] = names.index(own)
                 continue
-            place = quality_column(chosen.theirs, names)
-            if place is not None and place not in used and understands(self._cells(place)):
+            place = cell_values.quality_column(chosen.theirs, names)
+            if place is None or place in used:
+                continue
+            if understands(cells_of(self._file, place)):
                 places[name] = place
         return places
 
@@ -366,7 +358,7 @@ class TableReader:
         if self.long is not None:
             places = {'value': self.long.value}
         for theirs, place in places.items():
-            cells = self._cells(place)
+            cells = cells_of(self._file, place)
             if decimal_mark(cells, self._file.separator) is None:
                 example = next(c for c in cells if ',' in c)
                 raise RefusedError(
@@ -380,13 +372,10 @@ class TableReader:
 
     def _time_reader(self, time: int) -> TimeReader:
         name = self._file.names[time]
-        samples = self._cells(time)
-        if self._date is not None:
-            samples = [
-                f'{date[:11].strip()} {time}'
-                for date, time in self._file.samples(self._date, time)
-            ]
-        clock = TimeReader(samples, str(self.path), name, self._options, zone_in(name))
+        clock = TimeReader(
+            time_samples(self._file, time, self._date), str(self.path), name, self._options,
+            zone_in(name),
+        )  # fmt: skip
         abbreviated, place = local_zone_in(name)
         if abbreviated and not clock.zone:
             raise RefusedError(
@@ -401,11 +390,8 @@ class TableReader:
     def _read_times(self, frame: pd.DataFrame) -> IntArray:
         if isinstance(self._clock, RowClock):
             return self._clock.at(self.rows, len(frame))
-        column = frame[self._time]
-        if self._date is not None:
-            days = frame[self._date].astype('string').str.strip().str.slice(0, 11)
-            column = days.str.strip() + ' ' + column.astype('string').str.strip()
-        time_ns = self._clock.read(column)
+        assert self._time is not None
+        time_ns = self._clock.read(time_cells(frame, self._time, self._date))
         bad = time_ns == NEVER
         if bad.any():
             if not self.bad_times:
@@ -419,7 +405,9 @@ class TableReader:
             if name in self._quality:
                 cells = frame[self._quality[name]]
                 own = self.names[name] == name
-                block.quality[name] = to_quality(cells) if own else self._foreign(name, cells)
+                block.quality[name] = (
+                    cell_values.to_quality(cells) if own else self._foreign(name, cells)
+                )
 
     def _read_long(
         self, frame: pd.DataFrame, form: LongForm, coded: bool, block: RawBlock
@@ -436,7 +424,7 @@ class TableReader:
                 block.quality[name] = codes
 
     def _foreign(self, name: str, cells: pd.Series[Any]) -> ByteArray:
-        codes = foreign_quality(cells)
+        codes = cell_values.foreign_quality(cells)
         self._marked_bad[name] += int((codes == Quality.BAD).sum())
         return codes
 

@@ -33,31 +33,16 @@ class Remedy(NamedTuple):
 class RefusedError(InputError):
     """A table that can be read only with more options.
 
-    Parameters
-    ----------
-    where : object
-        The file.
-    problems : str or sequence of str
-        What is unclear, and which option to add; sentences without a final period.
-    remedies : sequence of Remedy
-        Options that solve all problems together; if there is a choice, the first one.
-    last : bool
-        True if the whole table was read, so that no further problem can follow.
-
-    Attributes
-    ----------
-    listing : str
-        The problems without the options.
+    ``where`` is the file, ``problems`` say what is unclear and which option to add, without a
+    final period; ``listing`` is their text. ``remedies`` solve all problems together; if there is
+    a choice, the first one. ``last`` says that the whole table was read, so that no further
+    problem can follow.
     """
 
     def __init__(
-        self,
-        where: object,
-        problems: str | Sequence[str],
-        remedies: Sequence[Remedy],
-        *,
+        self, where: object, problems: str | Sequence[str], remedies: Sequence[Remedy], *,
         last: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.where = str(where)
         self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
         self.remedies = tuple(remedies)
@@ -145,10 +130,7 @@ class TableOptions:
     def unpacked_bytes(self, packed: int, bound: int) -> float:
         """Return the maximum unpacked bytes of a file; at most ``bound`` without a user's limit.
 
-        Raises
-        ------
-        InputError
-            If the limit given by the user is not a positive number.
+        Raises `InputError` if the limit given by the user is not a positive number.
         """
         if not self.max_unpacked:
             return min(bound, max(_UNPACKED_FREELY, _UNPACKED_TIMES * packed))

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from valveflow_ros.logs.source import os_errors
 from valveflow_ros.logs.tables.binary import check_parquet
 from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
 from valveflow_ros.logs.tables.match import TIME
-from valveflow_ros.logs.tables.reader import TableReader
+from valveflow_ros.logs.tables.reader import RawBlock, TableReader
 from valveflow_ros.logs.tables.refusal import AS_SEEN, TableOptions
 from valveflow_ros.records import (
     SIGNALS,
@@ -131,21 +131,24 @@ def whole_table(reader: TableReader) -> RawTable:
     """Return all blocks of a table in time order; raises like `read_table`."""
     blocks = list(reader.blocks())
     notes = reader.notes()
-    raw = RawTable(
-        str(reader.path),
+    block = RawBlock(
         np.concatenate([block.time_ns for block in blocks]),
         {n: np.concatenate([b.columns[n] for b in blocks]) for n in reader.names},
-        dict(reader.names),
         {n: np.concatenate([b.quality[n] for b in blocks]) for n in blocks[0].quality},
-        (),
-        reader.bad_cells,
-        reader.bad_times,
-        dict(reader.units),
-        dict(reader.grounds),
-        reader.ignored,
         {n: np.concatenate([b.present[n] for b in blocks]) for n in blocks[0].present},
     )
-    return _ordered(raw, notes)
+    steps = np.diff(block.time_ns)
+    if (steps < 0).any():
+        newest_first = bool((steps <= 0).all())
+        order = np.arange(len(block.time_ns))[:: -1 if newest_first else 1]
+        block = block.at(order[np.argsort(block.time_ns[order], kind='stable')])
+        if not block.present:
+            notes.append(order_note(newest_first))
+    return RawTable(
+        str(reader.path), block.time_ns, block.columns, dict(reader.names), block.quality,
+        tuple(notes), reader.bad_cells, reader.bad_times, dict(reader.units),
+        dict(reader.grounds), reader.ignored, block.present,
+    )  # fmt: skip
 
 
 def open_table(
@@ -178,28 +181,6 @@ def order_note(newest_first: bool) -> str:
     return f'The rows were {kind}; they were sorted.'
 
 
-def _ordered(raw: RawTable, notes: list[str]) -> RawTable:
-    """Return the rows in time order."""
-    steps = np.diff(raw.time_ns)
-    if not (steps < 0).any():
-        return replace(raw, notes=tuple(notes))
-    newest_first = bool((steps <= 0).all())
-    order = np.arange(len(raw.time_ns))
-    if newest_first:
-        order = order[::-1]
-    order = order[np.argsort(raw.time_ns[order], kind='stable')]
-    if not raw.present:
-        notes = [*notes, order_note(newest_first)]
-    return replace(
-        raw,
-        time_ns=raw.time_ns[order],
-        columns={name: column[order] for name, column in raw.columns.items()},
-        quality={name: codes[order] for name, codes in raw.quality.items()},
-        notes=tuple(notes),
-        present={name: there[order] for name, there in raw.present.items()},
-    )
-
-
 def write_table(
     table: SampleTable, path: str | Path, extra: Mapping[str, FloatArray] | None = None
 ) -> None:
@@ -212,8 +193,6 @@ def write_table(
 
     Parameters
     ----------
-    table : SampleTable
-        The samples.
     path : str or Path
         ``.csv`` or ``.parquet``; replaced if it exists.
     extra : mapping of str to float64 (n,), optional

@@ -72,10 +72,7 @@ def cells_of(line: str, separator: str) -> list[str]:
 def decimal_mark(cells: list[str], separator: str) -> tuple[str, str] | None:
     """Return the decimal and the thousands mark of the numbers in these cells.
 
-    Returns
-    -------
-    tuple of str or None
-        ``None`` if a comma may be either, as in ``230,145``, and no other cell decides.
+    ``None`` if a comma may be either, as in ``230,145``, and no other cell decides.
     """
     text = [cell.strip() for cell in cells]
     if any(_BOTH_US.fullmatch(cell) for cell in text):
@@ -120,13 +117,7 @@ class Quotes:
         self._line = 1  # line number at the start of the rest
 
     def follow(self, text: str) -> None:
-        """Check the next piece.
-
-        Raises
-        ------
-        RecordingError
-            If a quoted cell is longer than the limits.
-        """
+        """Check the next piece; raises `RecordingError` if a quoted cell exceeds the limits."""
         text = self._rest + text
         end = _last_line(text, [])
         lines, rest = text[:end], text[end:]
@@ -200,10 +191,8 @@ class Lines(io.TextIOWrapper):
     def read(self, size: int | None = -1, /) -> str:
         """Return at most ``size`` characters, and never more than one piece.
 
-        Raises
-        ------
-        RecordingError
-            If a line is longer than `LONGEST_LINE` characters, or a quote is not closed.
+        Raises `RecordingError` if a line is longer than `LONGEST_LINE` characters, or a quote is
+        not closed.
         """
         text = super().read(_PIECE if size is None or size < 0 else min(size, _PIECE))
         ends = [place for mark in '\n\r' if (place := text.find(mark)) >= 0]
