@@ -126,11 +126,9 @@ def test_every_state_comes_back_as_it_was_and_equal_ones_are_equal_bytes(
     assert to_bytes(found) == data
 
 
-@given(st.dictionaries(st.text(), INTEGERS | st.lists(INTEGERS), max_size=3))
-@limits(max_examples=20)
-def test_whole_is_what_its_first_line_says(state: dict[str, Any]) -> None:
+def test_whole_is_what_its_first_line_says() -> None:
     """The slow truth: format, version and SHA-256 of all that follows the line."""
-    line, content = to_bytes(state).split(b'\n', 1)
+    line, content = to_bytes({'a': [1, 2]}).split(b'\n', 1)
     # What stands on disks already.
     assert line.startswith(b'valveflow-state 2 ')
     digest = hashlib.sha256(content).hexdigest().encode()
@@ -214,33 +212,24 @@ def test_every_single_cut_and_many_flips_are_noticed() -> None:
         with pytest.raises(DataError):
             from_bytes(data[:end])
     chance = np.random.default_rng(3)
-    for _ in range(500):
+    for _ in range(200):
         place, bit = int(chance.integers(len(data))), int(chance.integers(8))
         with pytest.raises(DataError):
             from_bytes(data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :])
 
 
-def test_arrays_and_numbers_of_numpy_come_back_as_they_were() -> None:
-    state = {
-        'array': np.arange(6.0).reshape(2, 3), 'number': np.float64(1.5), 'whole': np.int64(7),
-        'true': np.bool_(True), 'list': [np.zeros(0), {'deep': np.ones(2, dtype=np.uint8)}],
-        'tuple': (1, 2), 'nan': float('nan'),
-    }  # fmt: skip
+def test_numbers_of_numpy_and_tuples_come_back_as_plain_ones() -> None:
+    state = {'number': np.float64(1.5), 'whole': np.int64(7), 'true': np.bool_(True),
+             'tuple': (1, 2), 'nan': float('nan'), 'empty': [np.zeros(0)]}  # fmt: skip
     found = from_bytes(to_bytes(state))
-    np.testing.assert_array_equal(found['array'], state['array'])
     assert (found['number'], found['whole'], found['true']) == (1.5, 7, True)
-    assert found['list'][0].shape == (0,)
-    assert found['list'][1]['deep'].dtype == np.uint8
-    assert found['tuple'] == [1, 2]
+    assert (found['tuple'], found['empty'][0].shape) == ([1, 2], (0,))
     assert np.isnan(found['nan'])
-
-
-def test_a_state_that_names_an_array_it_does_not_hold_is_a_sentence() -> None:
     with pytest.raises(DataError, match=r'cannot be read \(KeyError\)'):
         from_bytes(to_bytes({'$array': 5}))
 
 
-@pytest.mark.parametrize('given', [5, None, [1.0, 2.0], np.zeros(3), np.zeros(2, dtype=np.int64)])
+@pytest.mark.parametrize('given', [5, [1.0, 2.0], np.zeros(3), np.zeros(2, dtype=np.int64)])
 def test_what_does_not_fit_an_array_changes_nothing(given: Any) -> None:
     arrays = {'first': np.ones(2), 'second': np.ones(2)}
     with pytest.raises(DataError, match="'second'"):
@@ -264,15 +253,6 @@ def test_of_two_states_that_do_not_fit_the_larger_one_is_kept_aside(folder: Stat
     assert folder.read() == b''
 
 
-def test_the_names_on_the_disk_are_those_that_an_earlier_run_wrote(folder: StateFolder) -> None:
-    folder.write(b'x')
-    folder.set_aside()
-    folder.write(b'y')
-    folder.write_curve(CURVE)
-    names = {'lock', 'monitor.state', 'monitor.state.unused', f'curve_{CURVE.model_id}.json'}
-    assert {p.name for p in folder.folder.iterdir()} == names
-
-
 def test_taking_back_twice_changes_nothing(folder: StateFolder) -> None:
     folder.write(b'mended')
     folder.aside.write_bytes(b'before')
@@ -292,13 +272,17 @@ def test_all_that_is_kept_is_its_owners(tmp_path: Path, mask: int) -> None:
     try:
         folder = StateFolder(tmp_path / 'deep' / 'state')
         folder.write(b'x')
+        folder.set_aside(of_use=True)
+        folder.aside.chmod(0o600)
         folder.write_curve(CURVE)
         folder.close()
     finally:
         os.umask(before)
     modes = {p.name: stat.S_IMODE(p.stat().st_mode) for p in folder.folder.iterdir()}
     assert set(modes.values()) == {0o600}
-    assert set(modes) == {LOCK, STATE, f'curve_{CURVE.model_id}.json'}
+    # By the names that an earlier run wrote.
+    names = {'lock', 'monitor.state', 'monitor.state.unused', f'curve_{CURVE.model_id}.json'}
+    assert set(modes) == names
     assert stat.S_IMODE(folder.folder.stat().st_mode) == 0o700
 
 
@@ -382,32 +366,20 @@ def test_nothing_is_locked_or_written_through_a_link(tmp_path: Path) -> None:
     folder.close()
 
 
-def test_a_file_that_is_too_large_is_not_even_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_state_that_is_too_large_or_a_link_is_a_sentence(
+    folder: StateFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = StateFolder(tmp_path)
-    monkeypatch.setattr(state_store, '_MAX_BYTES', 3)
-    folder.write(b'123')
-    assert folder.read() == b'123'
-    folder.write(b'1234')
-    with pytest.raises(RecordingError, match='too large to be a saved state'):
-        folder.read()
-    folder.close()
-
-
-def test_a_state_in_the_place_of_something_else_is_a_sentence(tmp_path: Path) -> None:
-    folder = StateFolder(tmp_path)
-    (tmp_path / 'elsewhere').write_bytes(b'somebody else keeps this')
-    (tmp_path / STATE).symlink_to(tmp_path / 'elsewhere')
+    elsewhere = tmp_path / 'elsewhere'
+    elsewhere.write_bytes(b'not ours')
+    folder.path.symlink_to(elsewhere)
     with pytest.raises(RecordingError, match='cannot be read'):
         folder.read()
     # A new one takes the place of the link, not of what it points to.
     folder.write(b'mine')
-    assert (folder.read(), (tmp_path / 'elsewhere').read_bytes()) == (
-        b'mine',
-        b'somebody else keeps this',
-    )
-    folder.close()
+    assert (folder.read(), elsewhere.read_bytes()) == (b'mine', b'not ours')
+    monkeypatch.setattr(state_store, '_MAX_BYTES', 3)
+    with pytest.raises(RecordingError, match='too large to be a saved state'):
+        folder.read()
 
 
 def test_closing_twice_lets_nobody_elses_descriptor_go(tmp_path: Path) -> None:
@@ -423,40 +395,26 @@ def test_closing_twice_lets_nobody_elses_descriptor_go(tmp_path: Path) -> None:
     again.close()
 
 
-def test_a_curve_is_kept_in_a_folder_made_again_but_never_in_that_of_another(
-    tmp_path: Path,
+def test_a_folder_that_another_program_removes_is_an_altered_one_and_made_again(
+    folder: StateFolder,
 ) -> None:
-    folder = StateFolder(tmp_path / 'state')
-    shutil.rmtree(tmp_path / 'state')
-    folder.write_curve(CURVE)
-    assert repr(folder.curve(CURVE.model_id)) == repr(CURVE)
-    shutil.rmtree(tmp_path / 'state')
-    other = StateFolder(tmp_path / 'state')
-    folder.write_curve(CURVE)
-    assert not list((tmp_path / 'state').glob('curve_*'))
-    folder.close()
-    other.close()
-
-
-def test_a_state_folder_that_cannot_be_asked_is_an_altered_one(tmp_path: Path) -> None:
-    folder = StateFolder(tmp_path / 'state')
+    place = folder.folder
     folder.write(b'x')
     assert not folder.altered
-    shutil.rmtree(tmp_path / 'state')
-    (tmp_path / 'state').symlink_to('state')
+    shutil.rmtree(place)
+    folder.write_curve(CURVE)
+    assert repr(folder.curve(CURVE.model_id)) == repr(CURVE)
+    shutil.rmtree(place)
+    # In that of another one nothing is kept.
+    other = StateFolder(place)
+    folder.write_curve(CURVE)
+    assert not list(place.glob('curve_*'))
+    other.close()
+    shutil.rmtree(place)
+    place.symlink_to('state')
     assert folder.altered
     with pytest.raises(RecordingError):
         folder.keep()
-    folder.close()
-
-
-def test_what_a_killed_writer_left_goes_at_the_next_start(tmp_path: Path) -> None:
-    StateFolder(tmp_path).close()
-    (tmp_path / '.monitor.state.1.2.tmp').write_bytes(b'half')
-    (tmp_path / 'monitor.state').write_bytes(b'whole')
-    folder = StateFolder(tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ['lock', 'monitor.state']
-    folder.close()
 
 
 # Loaded once; each line it reads begins a writer of its own and tells its number.
@@ -586,12 +544,8 @@ def test_a_mistyped_period_costs_no_window(tmp_path: Path) -> None:
     written(tmp_path)
     other = StateStore(settings(tmp_path, sample_period=2.0))
     # Its curve and reference are of use; its rows are kept for whoever corrects the mistake.
-    assert other.saved is not None
-    assert other.sentence == ''
+    assert (other.saved is None, other.sentence) == (False, '')
     other.close()
-    assert (tmp_path / 'state_unit' / STATE).read_bytes() == (
-        tmp_path / 'state_unit' / ASIDE
-    ).read_bytes()
     written(tmp_path, {'numbers': np.arange(1.0)}, sample_period=2.0)
     mended = StateStore(settings(tmp_path))
     assert mended.saved is not None
@@ -653,19 +607,12 @@ def test_a_state_that_is_not_whole_is_a_sentence_and_never_an_exception(
     assert 'alarms and reference of before are gone' in store.sentence
     assert store.sentence.endswith('.')
     assert store.lost
+    assert (store.item().level, store.item().sentence) == (Level.WARN, store.sentence)
     store.close()
-
-
-def test_a_damaged_state_is_seen_in_the_health_until_the_next_start(tmp_path: Path) -> None:
-    written(tmp_path)
-    path = tmp_path / 'state_unit' / STATE
-    path.write_bytes(path.read_bytes()[:-1])
-    for level, words in ((Level.WARN, 'is not used.'), (Level.OK, 'is saved regularly.')):
-        store = StateStore(settings(tmp_path))
-        item = store.item()
-        assert item.level == level
-        assert words in item.sentence
-        store.close()
+    # Until the next start.
+    again = StateStore(settings(tmp_path))
+    assert (again.item().level, 'is saved regularly.' in again.item().sentence) == (Level.OK, True)
+    again.close()
 
 
 def test_where_nothing_is_kept_nothing_is_asked_of_a_disk() -> None:
@@ -678,21 +625,15 @@ def test_where_nothing_is_kept_nothing_is_asked_of_a_disk() -> None:
     store.close()
 
 
-def test_an_adopted_curve_is_saved_at_once(tmp_path: Path) -> None:
-    store = StateStore(settings(tmp_path))
+def test_an_adopted_curve_is_saved_at_once_and_the_newest_state_last(tmp_path: Path) -> None:
+    given = settings(tmp_path)
+    store = StateStore(given)
     store.note([CurveAdopted(CURVE)])
     assert repr(store.curve(CURVE.model_id)) == repr(CURVE)
     with pytest.raises(DataError, match='was not saved'):
         store.curve('another')
-    store.close()
-
-
-def test_a_state_written_while_another_is_being_written_waits_for_it(tmp_path: Path) -> None:
-    given = settings(tmp_path)
-    store = StateStore(given)
     for k in range(5):
-        state = {'settings': dict(given), 'numbers': np.full(300_000, float(k))}
-        store.write(state, lambda: True)
+        store.write({'settings': dict(given), 'numbers': np.full(99_000, float(k))}, lambda: True)
     store.close()
     found = StateStore(given)
     assert found.saved is not None
@@ -769,25 +710,6 @@ def test_what_cannot_be_written_is_a_problem_until_it_can(
     store.close()
 
 
-def test_an_end_waits_for_the_one_being_written_but_not_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_store, '_LONGEST_S', 0.05)
-    monkeypatch.setattr(state_store, '_PATIENCE_S', 60.0)
-    go = threading.Event()
-    store = StateStore(settings(tmp_path))
-    store.write({'late': 1}, go.is_set)
-    (thread,) = (t for t in threading.enumerate() if t.name == 'state writer')
-    assert thread.daemon
-    store.finish()
-    assert store.busy
-    go.set()
-    monkeypatch.setattr(state_store, '_LONGEST_S', 20.0)
-    store.close()
-    assert not store.busy
-    assert from_bytes((tmp_path / 'state_unit' / STATE).read_bytes()) == {'late': 1}
-
-
 # Continuing an earlier run
 
 NAMES = {'characteristic': '/m/characteristic', 'breakpoints': '/m/breakpoints'}
@@ -795,6 +717,32 @@ LOG_NS = 1_700_000_000_000_000_000
 # As `Session` records them: before the first row there is no time of the plant, and the message
 # bears the time of the log.
 BEFORE, AFTER = Output('characteristic', b'curve', 0), Output('breakpoints', b'knots', 5_000)
+
+
+WORKER: Any = SimpleNamespace(poll=list)
+
+
+def restarted(
+    saved: dict[str, Any], given: Settings, inputs: dict[str, str], make: Any = None
+) -> tuple[Restart, LiveEngine, list[tuple[Level, str]]]:
+    """Return a restart from a saved state, its engine, and what was logged."""
+    whole = {'settings': Settings(), 'log_ns': 1, 'recording': 'folder', 'began': {}, **saved}
+    store: Any = SimpleNamespace(saved=whole, problem='', sentence='', curve=None)
+    logged: list[tuple[Level, str]] = []
+    names = {name: topic for name, topic in whole.get('topics', {}).items() if name not in inputs}
+    made = Restart(given, store, inputs, names, lambda *line: logged.append(line))
+    engine = made.engine(make or (lambda settings: LiveEngine(settings, WORKER)))
+    assert made.continues
+    return made, engine, logged
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> list[LoggedMessage]:
+    """What was recorded after the state was saved."""
+    tail: list[LoggedMessage] = []
+    monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
+    monkeypatch.setattr(restart, 'messages_since', lambda *_: tail)
+    return tail
 
 
 @pytest.mark.parametrize(
@@ -807,68 +755,45 @@ BEFORE, AFTER = Output('characteristic', b'curve', 0), Output('breakpoints', b'k
     ],
 )
 def test_each_output_stands_in_the_recording_once(
-    said: list[Output], again: list[Output], monkeypatch: pytest.MonkeyPatch
+    said: list[Output], again: list[Output], recorded: list[LoggedMessage]
 ) -> None:
     given = Settings()
-    tail = [
+    recorded += [
         LoggedMessage(NAMES[o.name], 'some/msg/Type', LOG_NS, o.time_ns or LOG_NS, o.data)
         for o in said
     ]
-    monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
-    monkeypatch.setattr(restart, 'messages_since', lambda *_: tail)
-    saved = {
-        'settings': dict(given), 'log_ns': 1, 'recording': 'folder', 'engine': None, 'began': {},
-        'topics': {**NAMES, 'journal': '/m/journal'},
-    }  # fmt: skip
-    store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
     engine: Any = SimpleNamespace(
         monitor=Monitor(given), aligner=Aligner(given), restore=lambda _: None
     )
     of_tail = iter([[BEFORE, AFTER]])
     outputs: Any = SimpleNamespace(of=lambda _: next(of_tail, []))
-    logged: list[tuple[Level, str]] = []
-    ours = Restart(given, store, {}, saved['topics'], lambda *line: logged.append(line))
-    assert ours.engine(lambda _: engine) is engine
-    assert (ours.continues, ours.folder) == (True, Path('folder'))
-    assert ours.log_ns == (LOG_NS if said else 1)
+    saved = {'engine': None, 'topics': {**NAMES, 'journal': '/m/journal'}}
+    ours, found, logged = restarted(saved, given, {}, lambda _: engine)
+    assert found is engine
+    assert (ours.folder, ours.log_ns) == (Path('folder'), LOG_NS if said else 1)
     assert list(ours.begin(given, engine, outputs)) == again
     assert logged == [(Level.OK, 'Going on after 0 rows of an earlier run.')]
 
 
-def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it_kept(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
-    monkeypatch.setattr(restart, 'messages_since', lambda *_: [])
-    then, now = Settings(), Settings({'steady_min': 180.0, 'alarm_floor': 2.0})
-    names = {name: f'/m/{name}' for name in OUTPUTS}
-    worker: Any = SimpleNamespace(poll=list)
-
-    def make(settings: Settings) -> LiveEngine:
-        return LiveEngine(settings, worker)
-
-    first = make(then)
+@pytest.mark.usefixtures('recorded')
+def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it_kept() -> None:
+    first = LiveEngine(Settings(), WORKER)
     first.monitor.set_reference(CURVE)
-    saved = {
-        'settings': then, 'log_ns': 1, 'recording': 'folder', 'began': {}, 'topics': names,
-        'engine': first.snapshot(),
-    }  # fmt: skip
-    for wanted, folder in ((now, None), (then.changed({'alarm_floor': 2.0}), Path('folder'))):
-        store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
-        logged: list[tuple[Level, str]] = []
-        ours = Restart(wanted, store, {}, names, lambda *line, to=logged: to.append(line))
-        engine = ours.engine(make)
-        assert (ours.continues, ours.folder) == (True, folder)
+    saved = {'topics': {name: f'/m/{name}' for name in OUTPUTS}, 'engine': first.snapshot()}
+    told = (
+        Level.OK,
+        'Since the state was saved steady_min changed. Segments were found again in 0 rows. '
+        'The reference and the alarms stay.',
+    )
+    for more, folder in (({'steady_min': 180.0}, None), ({}, Path('folder'))):
+        wanted = Settings({'alarm_floor': 2.0, **more})
+        ours, engine, logged = restarted(saved, wanted, {})
+        assert ours.folder == folder
         messages = list(ours.begin(wanted, engine, Outputs('unit')))
         assert engine.monitor.settings == wanted
         assert engine.monitor.reference.curve == CURVE
         kinds = [journal_entry(m.data).kind for m in messages if m.name == 'journal']
         assert kinds == [JournalKind.RESUMED, JournalKind.SETTINGS]
-        told = (
-            Level.OK,
-            'Since the state was saved steady_min changed. Segments were found again in 0 rows. '
-            'The reference and the alarms stay.',
-        )
         assert (told in logged) == (folder is None)
 
 
@@ -876,7 +801,6 @@ def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it
 def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(
     monkeypatch: pytest.MonkeyPatch, earlier: bool
 ) -> None:
-    given, names = Settings(), {name: f'/m/{name}' for name in OUTPUTS}
     text = Definitions().text('valveflow_msgs/msg/PlantSample')
     if earlier:  # before there was a code for unknown
         text = text.replace('QUALITY_GOOD=1', 'QUALITY_GOOD=0')
@@ -902,16 +826,10 @@ def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(
 
     monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
     monkeypatch.setattr(restart, 'messages_since', messages)
-    worker: Any = SimpleNamespace(poll=list)
-    first = LiveEngine(given, worker)
-    saved = {
-        'settings': given, 'log_ns': 1, 'recording': 'folder', 'began': {},
-        'topics': {**names, 'plant_sample': '/plant'}, 'engine': first.snapshot(),
-    }  # fmt: skip
-    store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
-    ours = Restart(given, store, {'plant_sample': '/plant'}, names, lambda *_: None)
-    engine = ours.engine(lambda settings: LiveEngine(settings, worker))
-    list(ours.begin(given, engine, Outputs('unit')))
+    topics = {**{name: f'/m/{name}' for name in OUTPUTS}, 'plant_sample': '/plant'}
+    saved = {'topics': topics, 'engine': LiveEngine(Settings(), WORKER).snapshot()}
+    ours, engine, _ = restarted(saved, Settings(), {'plant_sample': '/plant'})
+    list(ours.begin(Settings(), engine, Outputs('unit')))
     counts = engine.aligner.counts()
     assert counts['generated_power']['accepted'] == 60
     assert counts['generated_power']['bad_quality'] == 0
@@ -921,20 +839,13 @@ def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(
 
 @pytest.mark.parametrize('how', ['absent', 'other'])
 def test_a_state_of_another_version_is_used_where_it_fits_and_the_rest_is_told(how: str) -> None:
-    given, worker = Settings(), SimpleNamespace(poll=list)
-    first = LiveEngine(given, worker)  # type: ignore[arg-type]
+    first = LiveEngine(Settings(), WORKER)
     first.monitor.set_reference(CURVE)
     engine = first.snapshot()
+    engine['monitor']['diagnosing'] = {'another': 'version'}
     if how == 'absent':
         del engine['monitor']['diagnosing']
-    else:
-        engine['monitor']['diagnosing'] = {'another': 'version'}
-    saved = {'settings': given, 'log_ns': 1, 'recording': None, 'engine': engine}
-    store: Any = SimpleNamespace(saved=saved, problem='', sentence='', curve=None)
-    logged: list[tuple[Level, str]] = []
-    ours = Restart(given, store, {}, {}, lambda *line: logged.append(line))
-    found = ours.engine(lambda settings: LiveEngine(settings, worker))  # type: ignore[arg-type]
-    assert ours.continues
+    _, found, logged = restarted({'recording': None, 'engine': engine}, Settings(), {})
     assert found.monitor.reference.curve == CURVE
     assert logged == [(
         Level.WARN, 'The saved state is of another version. Discarded: the last diagnosis. The '
