@@ -73,6 +73,14 @@ def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]
     return values
 
 
+def declare_all(node: Node, table: Iterable[Parameter], *others: str) -> dict[str, object]:
+    """Do the same as `declare`, and warn of given parameters that are neither rows nor others."""
+    values = declare(node, table)
+    for sentence in unknown_overrides(node, [*values, *others]):
+        node.get_logger().warning(f'{sentence} It is ignored.')
+    return values
+
+
 def in_type(wanted: Iterable[RosParameter]) -> list[RosParameter]:
     """Return parameters converted to the types of the table; invalid ones are unchanged."""
     found = []

@@ -36,7 +36,13 @@ from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
 from valveflow_ros.ros.domain import Presence
 from valveflow_ros.ros.encoding import encode
-from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.diagnostics import (
+    Changes,
+    Item,
+    Level,
+    diagnostics_message,
+    log_at,
+)
 from valveflow_ros.ros.node.outputs import OUTPUTS, SERVICES
 from valveflow_ros.ros.node.polled_subscription import answer_request
 from valveflow_ros.ros.node.recording import check_record_directory
@@ -417,13 +423,7 @@ class MonitorNode(LifecycleNode):
         return [Item('name', Level.ERROR, sentence, {'Nodes of this name': self._same_name})]
 
     def _log(self, level: Level, text: str) -> None:
-        # Separate calls: rclpy allows only one severity per line of code.
-        if level == Level.OK:
-            self.get_logger().info(text)
-        elif level == Level.ERROR:
-            self.get_logger().error(text)
-        else:
-            self.get_logger().warning(text)
+        log_at(self.get_logger(), level, text)
 
     # Services
 
