@@ -78,13 +78,7 @@ def from_time(stamp: Time) -> int:
 
 
 def journal_entry(data: bytes) -> JournalEntry:
-    """Return a line of the journal as the engine's record.
-
-    Raises
-    ------
-    ValueError
-        If the bytes are no line of a journal.
-    """
+    """Return a line of the journal as the engine's record; raises `ValueError` if it is none."""
     try:
         message = deserialize_message(data, JournalMessage)
         return JournalEntry(
@@ -103,12 +97,8 @@ def journal_entry(data: bytes) -> JournalEntry:
 class Decoder:
     """Converts the bytes of an input message to readings.
 
-    Parameters
-    ----------
-    settings : Settings
-        Gives the unit in which each plain topic is sent.
-    definition : str
-        The ros2msg text of a recorded PlantSample; empty for the current definition.
+    The settings give the unit in which each plain topic is sent; ``definition`` is the ros2msg
+    text of a recorded PlantSample, empty for the current one.
     """
 
     def __init__(self, settings: Settings, definition: str = '') -> None:
@@ -127,13 +117,7 @@ class Decoder:
         return header_time_ns(data) if name == PLANT_SAMPLE else otherwise_ns
 
     def rows(self, name: str, data: bytes, time_ns: int) -> list[Row]:
-        """Return the readings in a message.
-
-        Raises
-        ------
-        ValueError
-            If the bytes are no message of this topic's type.
-        """
+        """Return the readings in a message; raises `ValueError` if it is not of its type."""
         return self._read[name](data, time_ns)
 
     def recorded(self, name: str, data: bytes, publish_time_ns: int) -> list[Row]:
@@ -187,13 +171,7 @@ def _sample_reader(quality: Sequence[int]) -> Callable[[bytes, int], list[Row]]:
 
 
 def sample_warnings(data: bytes, settings: Settings) -> list[str]:
-    """Return what in a PlantSample does not agree with the parameters.
-
-    Raises
-    ------
-    ValueError
-        The bytes are no PlantSample.
-    """
+    """Return what in a PlantSample does not agree with the parameters; raises `ValueError`."""
     sample, found = _sample(data), []
     for info in SIGNALS:
         name, code = f'{info.topic}_unit', getattr(sample, f'{info.topic}_quality')
@@ -214,13 +192,7 @@ def sample_warnings(data: bytes, settings: Settings) -> list[str]:
 
 
 def with_todays_codes(data: bytes) -> bytes:
-    """Convert a PlantSample with earlier quality codes (0 is good) to the current codes.
-
-    Raises
-    ------
-    ValueError
-        If the bytes are no PlantSample.
-    """
+    """Convert a PlantSample with earlier quality codes (0 is good) to the current codes."""
     sample = _sample(data)
     for info in _IN_ORDER:
         name = f'{info.topic}_quality'

@@ -149,11 +149,7 @@ class Story:
     A fault of one valve has an effect only while this valve is in use, so its alarm comes and
     goes with the load, and the monitor fits a new curve every few hours. The first alarm and
     curve are described in full, the others briefly or only if something has changed.
-
-    Parameters
-    ----------
-    fault_ns : int
-        Time at which the hidden fault begins.
+    ``fault_ns`` is the time at which the hidden fault begins.
     """
 
     def __init__(self, fault_ns: int) -> None:

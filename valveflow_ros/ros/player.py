@@ -95,12 +95,7 @@ class Player:
     def wait_for_listeners(self, patience_s: float) -> list[str]:
         """Wait until every input has a subscriber; return the topics that have none.
 
-        Nobody needs to listen to a covariate.
-
-        Parameters
-        ----------
-        patience_s : float
-            Maximum wait in s; 0 does not wait.
+        Nobody needs to listen to a covariate. A ``patience_s`` of 0 does not wait.
         """
         begun_s = time.monotonic()
         missing = self._without_listener()

@@ -44,27 +44,13 @@ TABLE: tuple[Parameter, ...] = (
 def effects_of(texts: Iterable[str]) -> list[EffectSpec]:
     """Read effects; a text may hold several, with semicolons between them.
 
-    Raises
-    ------
-    InputError
-        If an effect is unknown or its parameters are invalid.
+    Raises `InputError` if an effect is unknown or its parameters are invalid.
     """
-    return [
-        EffectSpec.parse(text)
-        for together in texts
-        for text in together.split(';')
-        if text.strip()
-    ]
+    return [EffectSpec.parse(text) for text in ';'.join(texts).split(';') if text.strip()]
 
 
 def start_ns_of(text: str, rate: float, now_ns: int) -> int:
-    """Return the time of the first sample.
-
-    Raises
-    ------
-    ParameterError
-        If the text is no time.
-    """
+    """Return the time of the first sample; raises `ParameterError` if the text is no time."""
     if not text.strip():
         return now_ns - now_ns % NS_PER_S if rate == 1.0 else DEFAULT_START_NS
     try:
@@ -79,13 +65,7 @@ def start_ns_of(text: str, rate: float, now_ns: int) -> int:
 
 
 def check_together(rate: float, stamped: bool, use_clock: bool) -> None:
-    """Refuse plain values in simulated time without a clock or stamps.
-
-    Raises
-    ------
-    ParameterError
-        If the times of the samples would be lost.
-    """
+    """Refuse plain values in simulated time without a clock or stamps: their times were lost."""
     if rate != 1.0 and not stamped and not use_clock:
         raise ParameterError(
             'rate',

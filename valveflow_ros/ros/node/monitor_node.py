@@ -97,13 +97,6 @@ class Watchdog:
     Nothing is sent if `NOTIFY_SOCKET` is not set. Pings are sent at twice the rate required by
     `WATCHDOG_USEC`, and only by `completed`, which is called after each complete cycle.
 
-    Parameters
-    ----------
-    environ : mapping, optional
-        Environment variables; by default those of the process.
-    clock : callable
-        Returns monotonic time in s.
-
     Attributes
     ----------
     period_s : float
@@ -148,11 +141,8 @@ class Watchdog:
     def completed(self, recorder: Callable[[], RecorderStatus | None]) -> None:
         """Send a ping, if one is due, after a complete cycle.
 
-        Parameters
-        ----------
-        recorder : callable
-            Returns the status of the recorder, None if there is no recorder. It is called only
-            when a ping is due. No ping is sent while the recorder is stuck.
+        ``recorder`` returns the status of the recorder, None if there is none, and is called only
+        when a ping is due. No ping is sent while the recorder is stuck.
         """
         now_s = self._clock()
         if not self._usec or now_s < self._next_s:
@@ -220,11 +210,7 @@ def _logged(transition: _Transition) -> _Transition:
 class MonitorNode(LifecycleNode):
     """The monitor as a managed node.
 
-    Parameters
-    ----------
-    stop : callable
-        Returns True if the process must end.
-    watchdog : Watchdog, optional
+    ``stop`` returns True if the process must end.
 
     Raises
     ------
