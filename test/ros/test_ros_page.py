@@ -148,6 +148,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     assert 'Traceback' not in processes.output(process)
 
 
+@pytest.mark.long
 def test_a_monitor_that_is_killed_and_started_again(processes, port, browser):
     """The real monitor and a real browser: it goes on with what comes."""
     page = processes.start(PAGE, '--port', str(port))

@@ -9,18 +9,17 @@ import os
 import stat
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from rclpy.context import Context
 from rclpy.parameter import Parameter as RosParameter
-from ros_helpers import LOOPBACK, PATIENCE_S, rtps_ports, wait_until
+from ros_helpers import LOOPBACK, PATIENCE_S, rtps_ports
 
-from valveflow_ros.errors import ParameterError, RecordingError, ValveflowError
+from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.logs import Recorder, RecorderSettings
 from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import domain, monitor_main, replay_main, simulator_main
@@ -225,20 +224,8 @@ def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(
 
 def within(limit_s: float, work: Callable[[], object]) -> None:
     """Do work that must not wait for anybody; raises what it raises."""
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            work()
-        except BaseException as error:  # noqa: BLE001
-            errors.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    thread.join(limit_s)
-    assert not thread.is_alive(), 'it waits'
-    if errors:
-        raise errors[0]
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(work).result(limit_s)
 
 
 @pytest.mark.parametrize('text', ['a\0b', 'a\nb', 'a\x1b[2Jb', 'x' * 501, 'a\u202eb'])
@@ -299,35 +286,8 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
     (elsewhere / 'victim').write_text('untouched')
     for name in (f'{made.name}_0.mcap.part', f'{made.name}_0.mcap', 'metadata.yaml'):
         (made / name).symlink_to(elsewhere / 'victim')
-    limits = RecorderSettings(flush_period_s=0.01, free_floor_bytes=0, retry_s=0.01)
-    recorder = Recorder(made, limits)
+    recorder = Recorder(made, RecorderSettings(free_floor_bytes=0, retry_s=0.01))
     recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
     recorder.record('/a', bytes(12), AT_NS, AT_NS)
     recorder.close(10.0)
-    assert (elsewhere / 'victim').read_text() == 'untouched'
-    assert [path.name for path in elsewhere.iterdir()] == ['victim']
-
-
-@pytest.mark.parametrize('umask', [0o000, 0o022, 0o077])
-def test_what_is_recorded_is_its_owners_whatever_the_umask(tmp_path: Path, umask: int) -> None:
-    before = os.umask(umask)
-    try:
-        limits = RecorderSettings(flush_period_s=0.01, rotate_s=0.05, free_floor_bytes=0)
-        recorder = Recorder(tmp_path / 'a' / 'b', limits)
-        recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
-        recorder.record('/a', bytes(12), AT_NS, AT_NS)
-        wait_until(lambda: recorder.status().files_finished, 'a finished split', 20.0)
-        recorder.close(20.0)
-    finally:
-        os.umask(before)
-    found = list((tmp_path / 'a').rglob('*'))
-    files = {path.name: stat.S_IMODE(path.stat().st_mode) for path in found if path.is_file()}
-    assert yaml.safe_load((tmp_path / 'a' / 'b' / 'metadata.yaml').read_text())
-    assert set(files.values()) == {0o600}
-    for folder in (tmp_path / 'a', tmp_path / 'a' / 'b'):
-        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-
-
-def test_a_refusal_is_one_of_ours() -> None:
-    assert issubclass(InsecureError, ValveflowError)
-    assert str(InsecureError('why')).endswith('(ROS_SECURITY_ENABLE): why.')
+    assert [path.read_text() for path in elsewhere.iterdir()] == ['untouched']
