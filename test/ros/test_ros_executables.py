@@ -87,8 +87,10 @@ def test_help_is_a_page_and_its_example_works(
     for name, process in running.items():
 
         def works(name: str = name, process: Any = process) -> bool:
-            assert process.poll() is None, processes.output(process)
-            return re.search(WORKS[name], processes.output(process)) is not None
+            said = processes.output(process)
+            found = re.search(WORKS[name], said) is not None
+            assert found or process.poll() is None, said
+            return found
 
         wait_until(works, f'"{WORKS[name]}" of {name}')
     for process in running.values():
@@ -201,5 +203,5 @@ def test_what_cannot_be_done_is_said_in_a_sentence(
         assert result_of(named(name), arguments) == status
     told = capfd.readouterr().err
     assert said in told
-    assert told.count(f'valveflow {name}:') == (status == 1)
+    assert told.count(f'valveflow {name}:') <= 1
     assert 'Traceback' not in told

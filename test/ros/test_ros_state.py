@@ -65,7 +65,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @given(st.dictionaries(st.text(), values, max_size=5))
-@limits(max_examples=60)
+@limits(max_examples=30)
 def test_every_state_comes_back_and_its_first_line_tells_its_checksum(
     state: dict[str, Any],
 ) -> None:

@@ -168,8 +168,9 @@ def test_a_newer_task_ends_an_older_one_and_a_hanging_one_is_ended() -> None:
         made.submit(TASK)
         first = made.pid
         made.submit(TASK)
-        assert made.pid not in (first, None)
+        wait_until(lambda: made.poll() or made.pid, 'another process', 10.0)
         pid = made.pid
+        assert pid not in (first, None)
         os.kill(pid, signal.SIGSTOP)
         (outcome,) = wait_until(made.poll, 'the outcome')
         assert 'longer than 1 s' in outcome.result
@@ -239,7 +240,7 @@ def test_tasks_and_results_arrive_as_they_were_sent() -> None:
     for sent in (TASK, shaped, DIAGNOSIS):
         task = task_from_bytes(task_to_bytes(sent))
         assert isinstance(task, FitTask | DiagnosisTask)
-        assert dict(task.settings) == dict(TASK.settings)
+        assert dict(task.settings) == dict(sent.settings)
         assert repr(replace(task, **bare)) == repr(replace(sent, **bare))
         for name in ('time_ns', 'u', 'power_mw', 'temperature_degc', 'spans'):
             column = getattr(TASK.contents, name)
