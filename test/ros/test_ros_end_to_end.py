@@ -39,7 +39,7 @@ typesys = pytest.importorskip('rosbags.typesys')
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 TAKEN = 'Samples taken in all runs'
-DAYS, SEED, FAULT_DAYS = 0.2, 7, 0.15
+DAYS, SEED, FAULT_DAYS = 0.22, 7, 0.17
 FAULT = f'gain_step:g=-0.12,t0_days={FAULT_DAYS}'
 FAULT_NS = DEFAULT_START_NS + round(FAULT_DAYS * 86400e9)
 SENT = [Signal.VALVE_COMMAND, *(info.signal for info in SIGNALS if info.required)]
