@@ -19,13 +19,21 @@ from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.fit.result import NOT_REFINED
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Judged, ResidualAlarm
+from valveflow_ros.monitoring.diagnosis_requests import FITS_AGAIN
+from valveflow_ros.monitoring.events import Diagnosed, JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 from valveflow_ros.ros.decoding import INPUTS, PLANT_SAMPLE
-from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.diagnostics import (
+    Changes,
+    Item,
+    Level,
+    diagnostics_message,
+    line_of,
+)
 from valveflow_ros.ros.node.health import (
     InputHealth,
     Publishers,
@@ -333,6 +341,25 @@ def test_changes_get_into_the_log_not_too_often_but_a_failure_at_once() -> None:
         changes = Changes(quiet_s=30.0)
         for item, at_s, told in course:
             assert changes.pick([item], float(at_s)) == [item] * told, (item, at_s)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'text', 'line'),
+    [
+        (JournalKind.FIT_REFUSED, 'Why.', (Level.WARN, 'no new curve: Why.')),
+        (JournalKind.RESET, 'Why.', (Level.WARN, 'Why.')),
+        (JournalKind.MISMATCH, FITS_AGAIN, (Level.OK, FITS_AGAIN)),
+        (JournalKind.MISMATCH, 'Why.', (Level.WARN, 'Why.')),
+        (JournalKind.DIAGNOSE, 'nightly', (Level.OK, 'diagnosis started: nightly')),
+        (JournalKind.SETTINGS, '', None),
+    ],
+)
+def test_what_the_engine_says_gets_into_the_log(kind: JournalKind, text: str, line: Any) -> None:
+    assert line_of(JournalEntry(0, kind, 0, 0, '', text)) == line
+    task: Any = None
+    found = '{"verdict": "named", "sentence": "It sticks."}'
+    assert line_of(Diagnosed(task, '', 'Why.')) == (Level.WARN, 'no diagnosis: Why.')
+    assert line_of(Diagnosed(task, found, '')) == (Level.WARN, 'diagnosis: It sticks.')
 
 
 # The curve, its reference and its alarms

@@ -31,21 +31,30 @@ _VALUE = {b'\x00\x01': struct.Struct('<d'), b'\x00\x00': struct.Struct('>d')}
 _HEAD = 4  # bytes of encapsulation before the data, which give the encoding
 
 
+def type_name(kind: type) -> str:
+    """Return the name of a message type, such as std_msgs/msg/Float64."""
+    return f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+
+
 @dataclass(frozen=True, slots=True)
 class InputTopic:
     """A topic to which the monitor subscribes; ``topic`` is its name before remapping."""
 
     name: str
     message_type: type
-    type_name: str
     topic: str
+
+    @property
+    def type_name(self) -> str:
+        """Return the name of the message type, as in a recording."""
+        return type_name(self.message_type)
 
 
 # The optional signal comes first, so that it is known when the required ones are complete.
 _IN_ORDER = tuple(sorted(SIGNALS, key=lambda info: info.required))
 INPUTS: tuple[InputTopic, ...] = (
-    *(InputTopic(info.topic, Float64, 'std_msgs/msg/Float64', info.topic) for info in _IN_ORDER),
-    InputTopic(PLANT_SAMPLE, PlantSample, 'valveflow_msgs/msg/PlantSample', PLANT_SAMPLE),
+    *(InputTopic(info.topic, Float64, info.topic) for info in _IN_ORDER),
+    InputTopic(PLANT_SAMPLE, PlantSample, PLANT_SAMPLE),
 )
 INPUT_BY_NAME = {topic.name: topic for topic in INPUTS}
 INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
@@ -54,13 +63,8 @@ INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
 def inputs_of(settings: Settings) -> tuple[InputTopic, ...]:
     """Return all topics to which the monitor subscribes: those of covariates come first."""
     beside = map(parts, entries_of(settings))
-    return (
-        *(
-            InputTopic(f'covariate {name}', Float64, 'std_msgs/msg/Float64', topic)
-            for name, topic, _ in beside
-        ),
-        *INPUTS,
-    )
+    found = (InputTopic(f'covariate {name}', Float64, topic) for name, topic, _ in beside)
+    return (*found, *INPUTS)
 
 
 def header_time_ns(data: bytes) -> int:

@@ -508,12 +508,13 @@ def recorder_item(recording: Recording) -> Item:
         'Files finished': status.files_finished,
         'Bytes written': status.bytes_written,
     }
+    level, sentence = Level.OK, 'Recording.'
     if status.state != RecorderState.RECORDING:
-        return Item('recorder', Level.ERROR, f'Not recording: {status.reason}', values)
-    if dropped or status.lost:
+        level, sentence = Level.ERROR, f'Not recording: {status.reason}'
+    elif dropped or status.lost:
         told = f'{counted(dropped + status.lost, "message is", "messages are")} missing.'
-        return Item('recorder', Level.WARN, f'{told} {status.loss}'.rstrip(), values)
-    return Item('recorder', Level.OK, 'Recording.', values)
+        level, sentence = Level.WARN, f'{told} {status.loss}'.rstrip()
+    return Item('recorder', level, sentence, values)
 
 
 def model_item(monitor: Monitor) -> Item:

@@ -417,8 +417,7 @@ class MonitorNode(LifecycleNode):
         self, name: str, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """Execute a service request."""
-        response.success, response.message = self._done(functools.partial(self._answer, name))
-        return response
+        return self._done(functools.partial(self._answer, name), response)
 
     def _operate(
         self, request: OperateAlarm.Request, response: OperateAlarm.Response
@@ -436,19 +435,23 @@ class MonitorNode(LifecycleNode):
             hours = self.settings.real('alarm_shelve_time') / 3600.0
             return _ONE_ALARM[action].format(request.name, hours)
 
-        response.success, response.message = self._done(answer)
-        return response
+        return self._done(answer, response)
 
-    def _done(self, answer: Callable[[Session], str]) -> tuple[bool, str]:
-        """Execute an action; return success and a sentence that says if it is not on disk yet."""
+    def _done(self, answer: Callable[[Session], str], response: Any) -> Any:
+        """Execute an action; the sentence of the response says if it is not on disk yet."""
         session = self.session
+        response.success, response.message = False, _NOT_RUNNING
         if session is None or not session.listening:
-            return False, _NOT_RUNNING
+            return response
         try:
             sentence = answer(session)
         except ValveflowError as error:
-            return False, str(error)
-        return True, sentence if session.confirm() else f'{sentence} {_NOT_ON_DISK}'
+            response.message = str(error)
+            return response
+        on_disk = session.confirm()
+        response.success = True
+        response.message = sentence if on_disk else f'{sentence} {_NOT_ON_DISK}'
+        return response
 
     def _answer(self, name: str, session: Session) -> str:
         monitor, engine = session.engine.monitor, session.engine
