@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,17 +16,16 @@ from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import open_log
-from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.ros.decoding import PLANT_SAMPLE, journal_entry
+from valveflow_ros.ros.decoding import PLANT_SAMPLE
 from valveflow_ros.ros.player import Player
 from valveflow_ros.ros.simulator_main import effects_of, stamped_steps
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 LOG = simulate(0.13, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.1'])).table
-# Rows at the fault, and when its alarm has been raised for a while.
-FAULT, RAISED = 8640, 10_400
+# Rows at the fault, when its alarm has been raised for a while, and at the end.
+FAULT, RAISED, PLAYED = 8640, 10_400, 10_500
 
 
 class Plant(Listener):
@@ -89,11 +87,6 @@ def killed(monitor: Any) -> None:
     monitor.wait()
 
 
-def journal(folder: Path) -> list[Any]:
-    found = open_log(folder).iter_messages([f'{MONITOR}/journal'])
-    return [journal_entry(message.data) for message in found]
-
-
 def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     processes: Processes, plant: Plant, tmp_path: Path
 ) -> None:
@@ -135,30 +128,38 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     assert plant.trigger('acknowledge_alarms')[0]
     plant.until(lambda: plant.alarms[-1].state == Alarm.ACKNOWLEDGED, 'the acknowledgement')
     assert plant.alarms[-1].occurrence == raised.occurrence
-    plant.play_to(len(LOG), known)
+    plant.play_to(PLAYED, known)
     ended(processes, third, 10.0)
 
     (folder,) = tmp_path.glob('valveflow_*')
     assert not list(folder.glob('*.part'))
     log = open_log(folder)
     assert log.warnings == ()
-    assert log.topics['/plant_sample'].count == len(LOG)
+    assert log.topics['/plant_sample'].count == PLAYED
     result = verify(folder)
-    assert (result.difference, result.rows) == ('', len(LOG))
+    assert (result.difference, result.rows) == ('', PLAYED)
     assert result.compared['alarms'] >= 4
     with pytest.raises(RecordingError, match='goes on from an earlier recording'):
         verify(max(folder.glob('*.mcap')))
 
+    with_other_parameters_it_goes_on_from_what_was_confirmed(processes, plant, tmp_path)
+    assert list(tmp_path.glob('valveflow_*')) == [folder]
 
-@pytest.mark.parametrize('kept_by', ['state', pytest.param('recording', marks=pytest.mark.long)])
-def test_with_other_parameters_it_goes_on_from_what_was_confirmed(
-    processes: Processes, plant: Plant, tmp_path: Path, kept_by: str
+
+def with_other_parameters_it_goes_on_from_what_was_confirmed(
+    processes: Processes, plant: Plant, folder: Path
 ) -> None:
-    given: dict[str, object] = {'record_flush': 60.0, 'alarm_suppress_time': 86400.0}
-    if kept_by == 'state':
-        given |= {'record': False, 'state_directory': str(tmp_path / 'state')}
-    first = start_monitor(processes, tmp_path, **given)
-    plant.play_to_the_alarm()
+    """Those of the alarms and of the segments may be other ones, and nothing is recorded."""
+    given: dict[str, object] = {
+        'record': False, 'state_directory': str(folder / 'state_unit'), 'steady_min': 150.0,
+        'alarm_floor': 2.0, 'alarm_suppress_time': 86400.0,
+    }  # fmt: skip
+    first = start_monitor(processes, folder, **given)
+    before = 'from before, alarm residual, acknowledged'
+    plant.until(lambda: before in processes.output(first), 'the alarm of before')
+    changed = 'Since the state was saved steady_min changed. Segments were found again in '
+    assert changed in processes.output(first)
+    assert [(a.name, a.state) for a in plant.standing()] == [('residual', Alarm.ACKNOWLEDGED)]
     for name, action, words in (
         ('', 'shelve', "There is no alarm ''; choose residual or curve_shift."),
         ('residual', 'stop', "There is no action 'stop'; choose acknowledge, shelve or unshelve."),
@@ -170,31 +171,11 @@ def test_with_other_parameters_it_goes_on_from_what_was_confirmed(
         ),
     ):
         assert plant.operate(name, action) == (False, words)
-    begun_s = time.monotonic()
-    answer = plant.operate('residual', 'acknowledge')
-    killed(first)
-    print(f'confirmed after {time.monotonic() - begun_s:.3f} s')
-    assert answer == (True, 'The alarm residual is acknowledged.')
-    known = plant.listeners()
-
-    # The parameters of the alarms and those of the segments may be other ones.
-    second = start_monitor(processes, tmp_path, **given, alarm_floor=2.0, steady_min=150.0)
-    before = 'from before, alarm residual, acknowledged'
-    plant.until(lambda: before in processes.output(second), 'the alarm of before')
-    told = processes.output(second)
-    assert 'Since the state was saved steady_min changed. Segments were found again in ' in told
-    assert [(a.name, a.state) for a in plant.standing()] == [('residual', Alarm.ACKNOWLEDGED)]
     success, sentence = plant.operate('residual', 'shelve')
+    killed(first)
     assert success
     assert sentence.startswith('The alarm residual is shelved for 8 h; then it comes back')
-    plant.play_to(RAISED + 100, known)
+    second = start_monitor(processes, folder, **given)
+    before = 'from before, alarm residual, shelved'
+    plant.until(lambda: before in processes.output(second), 'the shelved alarm')
     ended(processes, second, 10.0)
-    folders = sorted(tmp_path.glob('valveflow_*'))
-    if kept_by == 'state':
-        assert folders == []
-        return
-    # Other parameters make another recording; the one before holds all that was confirmed.
-    assert len(folders) == 2
-    assert verify(folders[0]).difference == ''
-    (entry,) = (e for e in journal(folders[0]) if e.kind == JournalKind.ACKNOWLEDGE)
-    assert entry.text == 'residual'
