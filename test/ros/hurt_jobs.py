@@ -67,9 +67,25 @@ def writes_nonsense(task: Any) -> Any:
     time.sleep(3600.0)
 
 
-def with_piece(task: Any, **different: float) -> Any:
-    curve = good(task)
-    return replace(curve, pieces=(replace(curve.pieces[0], **different), curve.pieces[1]))
+def nothing(task: Any) -> Any:
+    """Give no result at all."""
+
+
+def nan(task: Any) -> Any:
+    first, second = good(task).pieces
+    return replace(good(task), pieces=(replace(first, slope=float('nan')), second))
+
+
+def backwards(task: Any) -> Any:
+    return replace(good(task), pieces=good(task).pieces[::-1])
+
+
+def of_other_data(task: Any) -> Any:
+    return replace(good(task), source=example_curve(Settings()).source).with_id()
+
+
+def renamed(task: Any) -> Any:
+    return replace(good(task), model_id='000000000000')
 
 
 def told(task: Any) -> Any:
@@ -77,21 +93,16 @@ def told(task: Any) -> Any:
     return [*BAD_FITS, prints][task.request_ns](task)
 
 
-def nothing(task: Any) -> Any:
-    """Give no result at all."""
-
-
 BAD_FITS = {
     raises: 'failed unexpectedly: a fault (ZeroDivisionError, hurt_jobs.py, line',
     refuses: 'There is no curve in these data.',
     greedy: 'more memory than there is',
     nothing: 'gave no curve',
-    lambda task: with_piece(task, slope=float('nan')): 'a curve that cannot be',
-    lambda task: replace(good(task), pieces=good(task).pieces[::-1]): 'a curve that cannot be',
-    lambda task: replace(good(task), source=example_curve(Settings()).source).with_id():
-        'other data',
-    lambda task: replace(good(task), model_id='000000000000'): 'its own name',
-}  # fmt: skip
+    nan: 'a curve that cannot be',
+    backwards: 'a curve that cannot be',
+    of_other_data: 'other data',
+    renamed: 'its own name',
+}
 
 
 def diagnosed(task: Any) -> Any:
@@ -109,12 +120,19 @@ def no_verdict(task: Any) -> Any:
     return replace(content, text=content.text.replace('nothing', 'perhaps'))
 
 
+def diagnosed_other_data(task: Any) -> Any:
+    return replace(diagnosed(task), window_end_ns=1)
+
+
+def half(task: Any) -> Any:
+    return replace(diagnosed(task), text='{"verdict": "named", "sentence": "Something."}')
+
+
 BAD_DIAGNOSES = {
     raises: 'The diagnosis failed unexpectedly: a fault (ZeroDivisionError',
     refuses: 'There is no curve in these data.',
     nothing: 'gave no result',
-    lambda task: replace(diagnosed(task), window_end_ns=1): 'answered for other data',
+    diagnosed_other_data: 'answered for other data',
     no_verdict: 'gave no verdict',
-    lambda task: replace(diagnosed(task), text='{"verdict": "named", "sentence": "Something."}'):
-        'cannot be checked (KeyError)',
-}  # fmt: skip
+    half: 'cannot be checked (KeyError)',
+}
