@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import numpy as np
 import psutil
 
-from benchmarks.load.steady import Steadiness
 from benchmarks.load.trial import REQUIRED, Case, Run
 
 CASES = ('rates', 'headroom', 'stall', 'refit', 'flood')
@@ -18,6 +19,8 @@ _REFIT_EVERY_S = 5.0
 _SOAK_REFIT_S = 60.0
 _FLOODED = 'valve_opening'
 _CPU = {1.0: 3.0, 100.0: 6.0, 1000.0: 20.0}
+_LOOK_S, _HOUR_S = 60.0, 3600.0
+_SHARED = Path('/dev/shm')
 _LATE = {'latency_p99_ms': 25.0, 'latency_max_ms': 100.0}
 
 
@@ -97,7 +100,7 @@ def _soak(hours: float, reliable: bool) -> Case:
     return Case(
         SOAK, f'4 topics at 100 Hz for {hours:g} hours, recorded, with a state and refits',
         _even(100.0), 3600.0 * hours, curve=True, reliable=reliable,
-        meanwhile=Steadiness(_Refits(_SOAK_REFIT_S), 360.0 * hours),
+        meanwhile=_Steadiness(_Refits(_SOAK_REFIT_S), 360.0 * hours),
         parameters={'keep_state': True},
         limits={
             'cpu_percent': 6.0, 'latency_p99_ms': 25.0, 'memory_mib': 250.0,
@@ -161,3 +164,43 @@ def _hear_alarms(run: Run, _at_s: float) -> None:
     for delay_s in run.ears.alarm_delays_s():
         run.notes['alarm_messages'] = run.notes.get('alarm_messages', 0) + 1
         run.measured['alarm_s'] = max(run.measured.get('alarm_s', 0.0), delay_s)
+
+
+class _Steadiness:
+    """Look once a minute at what the monitor holds.
+
+    Before ``settled_s`` nothing is judged: caches fill, the first files are opened. ``also`` is
+    what else happens meanwhile.
+    """
+
+    def __init__(self, also: Callable[[Run, float], None], settled_s: float) -> None:
+        self._also, self._settled_s = also, settled_s
+        self._looks: list[tuple[float, ...]] = []
+        self._next_s = 0.0
+
+    def __call__(self, run: Run, at_s: float) -> None:
+        """Do what is due."""
+        self._also(run, at_s)
+        if at_s < self._next_s:
+            return
+        self._next_s = at_s + _LOOK_S
+        process = run.monitor.process
+        with process.oneshot():
+            held = (run.monitor.memory_mib(), process.num_fds(), process.num_threads())
+        self._looks.append((at_s, *held, sum(1 for _ in _SHARED.iterdir())))
+        looks = np.array(self._looks)
+        looks = looks[looks[:, 0] >= self._settled_s]
+        if len(looks) < 2:
+            return
+        hours = looks[:, 0] / _HOUR_S
+        run.measured['memory_mib_per_hour'] = float(np.polyfit(hours, looks[:, 1], 1)[0])
+        # The first third against the last: a descriptor that is open for a moment is no leak.
+        third = max(1, len(looks) // 3)
+        for name, column in (('descriptors', 2), ('threads', 3), ('shared_memory_files', 4)):
+            least, now = looks[:third, column].min(), looks[-third:, column].min()
+            run.measured[f'more_{name}'] = float(now - least)
+        run.notes['looks'] = len(self._looks)
+        run.notes['memory_mib_by_tenth'] = [
+            round(float(part.mean()), 1) for part in np.array_split(looks[:, 1], 10) if len(part)
+        ]
+        run.notes['descriptors'], run.notes['threads'] = map(int, looks[-1, 2:4])

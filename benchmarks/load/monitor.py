@@ -108,14 +108,7 @@ class Ears:
 
 
 class Monitor:
-    """The monitor's process, with the watch of `probed`.
-
-    Parameters
-    ----------
-    folder : Path
-        For everything it writes.
-    parameters : mapping
-    """
+    """The monitor's process, with the watch of `probed`; it writes into a folder."""
 
     def __init__(self, folder: Path, parameters: Mapping[str, object]) -> None:
         self.recordings = folder / 'recordings'

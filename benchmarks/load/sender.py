@@ -37,16 +37,9 @@ _PATIENCE_S = 120.0
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """What is sent on a topic.
+    """What is sent on a topic: the k-th message adds k times `NUMBER` to ``base``.
 
-    Attributes
-    ----------
-    topic : str
-    rate_hz : float
-    base : float
-        The value; the k-th message adds k times `NUMBER` to it.
-    step_at_s, step_by : float
-        From then on that much is added.
+    From ``step_at_s`` on ``step_by`` is added, too.
     """
 
     topic: str

@@ -11,16 +11,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from benchmarks.load.counting import Account, account, fed
+import numpy as np
+
 from benchmarks.load.monitor import Ears, History, Monitor
 from benchmarks.load.sender import Plan, Stream
+from valveflow_ros.logs import open_log
 from valveflow_ros.records import SIGNALS
+from valveflow_ros.signals.align import REASONS
 
 REQUIRED = tuple(info.topic for info in SIGNALS if info.required)
 _VALUES = {
@@ -28,6 +31,7 @@ _VALUES = {
     'generated_power': 400.0,
 }  # fmt: skip
 _PATIENCE_S = 180.0
+_VALUE_AT = 4  # bytes before the value of a Float64
 _ROOM_BYTES = 4 << 20
 
 
@@ -35,29 +39,11 @@ _ROOM_BYTES = 4 << 20
 class Case:
     """What is tried.
 
-    Attributes
-    ----------
-    name, what : str
-    rates_hz : dict
-        By topic.
-    seconds : float
-    curve : bool
-        Whether there is a curve, from a history played before.
-    reliable : bool
-    parameters : dict
-        Of the monitor, besides those of every run.
-    meanwhile : callable, optional
-        Called again and again while messages are sent, with the run and the seconds since.
-    step_by : float
-        The power jumps by so much after 5 s, MW.
-    slack : int
-        Messages of a topic that may be unaccounted for.
-    lossless : tuple of str
-        Topics that must not lose anything.
-    needs_room : bool
-        Nothing can be lost only where a socket may hold 4 MiB; elsewhere a loss is a passed limit.
-    limits : dict
-        By the names of what is measured.
+    A `curve` comes from a history played before. `meanwhile` is called again and again while
+    messages are sent, with the run and the seconds since. After 5 s the power jumps by `step_by`
+    MW. Of a topic `slack` messages may be unaccounted for; the `lossless` ones must not lose
+    anything, which is a passed limit where a socket holds less than 4 MiB and the case
+    `needs_room`. `limits` are by the names of what is measured.
     """
 
     name: str
@@ -73,6 +59,98 @@ class Case:
     lossless: tuple[str, ...] = REQUIRED
     needs_room: bool = False
     limits: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """What became of the messages of one topic.
+
+    `sent` is by the sender; `recorded`, `repeated`, `disordered` and `missing` are by the numbers
+    that the messages in the file carry; `dropped` is by the recorder's account in the file; the
+    others are by the monitor's /diagnostics; `fed` readings were judged by the engine.
+    """
+
+    sent: int
+    recorded: int
+    repeated: int
+    disordered: int
+    missing: int
+    received: int
+    lost: int
+    missed_at_start: int
+    irregular: int
+    unreadable: int
+    dropped: int
+    fed: int
+
+    @property
+    def gone(self) -> int:
+        """Return what the monitor says it did not get."""
+        return self.lost + self.missed_at_start
+
+    def faults(self, topic: str, slack: int = 0) -> list[str]:
+        """Return what does not add up; so many may be unaccounted for."""
+        equations = (
+            ('sent', self.sent, 'recorded + dropped + lost', self.kept + self.gone, slack),
+            ('received', self.received, 'recorded + dropped', self.kept, 0),
+            ('received', self.received, 'fed + unreadable', self.fed + self.unreadable, 0),
+            ('missing in the file', self.missing, 'dropped + lost', self.dropped + self.gone,
+             slack),
+            ('recorded twice', self.repeated, 'none', 0, 0),
+            ('recorded out of order', self.disordered, 'none', 0, 0),
+        )  # fmt: skip
+        return [
+            f'{topic}: {left} is {a}, and {right} is {b}'
+            for left, a, right, b, most in equations
+            if abs(a - b) > most
+        ]
+
+    @property
+    def kept(self) -> int:
+        """Return what the recorder was given."""
+        return self.recorded + self.dropped
+
+
+def fed(ears: Ears, topic: str) -> int:
+    """Return how many readings of a signal the engine has judged; late ones are accepted too."""
+    kinds = (reason.replace('_', ' ') for reason in REASONS if reason != 'late')
+    return sum(ears.number(f'input {topic}', f'Readings {kind} in all runs') for kind in kinds)
+
+
+def account(
+    ears: Ears,
+    recordings: Path,
+    streams: list[Stream],
+    sent: Mapping[str, int],
+    fed_before: Mapping[str, int],
+) -> dict[str, Account]:
+    """Count a run that is over; ``fed_before`` is what the engine had judged before, by topic."""
+    (folder,) = (p for p in recordings.iterdir() if p.is_dir())
+    log = open_log(folder)
+    counters = log.metadata.get('valveflow_recorder', {})
+    found = {}
+    for stream in streams:
+        topic = f'/{stream.topic}'
+        data = b''.join(m.data[_VALUE_AT:] for m in log.iter_messages([topic]))
+        numbers = stream.numbers(np.frombuffer(data, '<f8'))
+        different = len(np.unique(numbers))
+        item = f'input {stream.topic}'
+        found[stream.topic] = Account(
+            sent=sent[stream.topic],
+            recorded=len(numbers),
+            repeated=len(numbers) - different,
+            disordered=int(np.sum(np.diff(numbers) < 0)),
+            missing=sent[stream.topic] - different,
+            received=ears.number(item, 'Messages received'),
+            lost=ears.number(item, 'Messages lost on the way'),
+            missed_at_start=ears.number(item, 'Messages sent before the first received'),
+            irregular=ears.number(item, 'Messages with irregular numbers'),
+            unreadable=ears.number(item, 'Messages that cannot be read')
+            + ears.number(item, 'Messages without a time'),
+            dropped=int(counters.get(f'dropped {topic}', 0)),
+            fed=fed(ears, stream.topic) - fed_before[stream.topic],
+        )
+    return found
 
 
 class Sender:

@@ -61,23 +61,18 @@ def test_what_was_stopped_goes_on(tmp_path):
     assert vf.open_log(path).to_dataframe().equals(vf.open_log(whole.path).to_dataframe())
 
 
-def test_parts_of_something_else_are_not_mixed(tmp_path):
-    path = tmp_path / 'log.mcap'
+def test_parts_of_something_else_are_not_mixed_and_a_damaged_one_is_named(tmp_path):
+    path, end_ns = tmp_path / 'log.mcap', T0 + 20 * HOUR_NS
     with pytest.raises(DataError):
-        import_history(Source(fail_at=1), T0, T0 + 20 * HOUR_NS, path)
+        import_history(Source(fail_at=2), T0, end_ns, path)
     with pytest.raises(RecordingError, match='is of an import of something else'):
-        import_history(Source(), T0, T0 + 21 * HOUR_NS, path)
-
-
-def test_a_part_that_is_damaged_is_named(tmp_path):
-    path = tmp_path / 'log.mcap'
-    with pytest.raises(DataError):
-        import_history(Source(fail_at=2), T0, T0 + 20 * HOUR_NS, path)
-    (tmp_path / 'log.mcap.parts' / '000001.npz').write_bytes(b'PK no zip')
+        import_history(Source(), T0, end_ns + HOUR_NS, path)
+    part = tmp_path / 'log.mcap.parts' / '000001.npz'
+    part.write_bytes(b'PK no zip')
     with pytest.raises(RecordingError, match='is damaged; remove it'):
-        import_history(Source(), T0, T0 + 20 * HOUR_NS, path)
-    (tmp_path / 'log.mcap.parts' / '000001.npz').unlink()
-    assert import_history(Source(), T0, T0 + 20 * HOUR_NS, path).messages == 20 * 60 * 4
+        import_history(Source(), T0, end_ns, path)
+    part.unlink()
+    assert import_history(Source(), T0, end_ns, path).messages == 20 * 60 * 4
 
 
 @pytest.mark.skipif(importlib.util.find_spec('asyncua') is None, reason='asyncua is an extra')
@@ -104,32 +99,20 @@ def test_the_history_of_a_server_by_the_command(tmp_path, capsys):
     assert 'nobody listens there' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ('words', 'sentence'),
-    [
-        (['--from', '2026-01-01'], 'wants --mapping FILE, --from TIME, --to TIME and -o LOG'),
-        (['--from', 'yesterday', '--to', '2026-01-01'], "'yesterday' is no time"),
-        (['--from', '2026-01-02', '--to', '2026-01-01'], '--from must be before --to'),
-        (
-            ['--from', '2026-01-01', '--to', '2026-01-02', '--unit', 'U9'],
-            '--unit must be one of U1',
-        ),
-        (
-            ['--from', '2026-01-01', '--to', '2026-01-02', '--column', 'valve_opening=x'],
-            'says all about the nodes',
-        ),
-    ],
-)
+DAY = '--from 2026-01-01 --to 2026-01-02'
+REFUSED = [
+    ('--from 2026-01-01', 'wants --mapping FILE, --from TIME, --to TIME and -o LOG'),
+    ('--from yesterday --to 2026-01-01', "'yesterday' is no time"),
+    ('--from 2026-01-02 --to 2026-01-01', '--from must be before --to'),
+    (f'{DAY} --unit U9', '--unit must be one of U1'),
+    (f'{DAY} --column valve_opening=x', 'says all about the nodes'),
+]
+
+
+@pytest.mark.parametrize(('words', 'sentence'), REFUSED)
 def test_what_is_wrong_is_told(words, sentence, tmp_path, capsys):
     pytest.importorskip('asyncua')
     path = write_mapping(tmp_path, mapping(1))
-    given = [
-        'import',
-        'opcua://127.0.0.1:1',
-        '--mapping',
-        str(path),
-        '-o',
-        str(tmp_path / 'x.mcap'),
-    ]
-    assert main([*given, *words]) in (1, 2)
+    given = f'import opcua://127.0.0.1:1 --mapping {path} -o {tmp_path}/x.mcap {words}'
+    assert main(given.split()) in (1, 2)
     assert sentence in capsys.readouterr().err

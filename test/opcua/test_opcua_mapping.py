@@ -96,13 +96,17 @@ def test_what_cannot_be_used_is_refused_in_words(content, sentence, tmp_path):
     assert str(refused.value).endswith('.')
 
 
-def test_files_that_are_none_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ('content', 'words'),
+    [
+        (None, 'cannot be read'),
+        (b'units: [\n', 'is no YAML in line 2'),
+        (b'\xff\xfe', 'is no YAML'),
+    ],
+)
+def test_files_that_are_none_are_refused(tmp_path, content, words):
     path = tmp_path / 'opcua.yaml'
-    with pytest.raises(ValveflowError, match='cannot be read'):
-        read_mapping_file(path)
-    path.write_text('units: [\n')
-    with pytest.raises(ValveflowError, match='is no YAML in line 2'):
-        read_mapping_file(path)
-    path.write_bytes(b'\xff\xfe\x00')
-    with pytest.raises(ValveflowError, match='is no YAML'):
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValveflowError, match=words):
         read_mapping_file(path)

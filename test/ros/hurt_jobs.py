@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs that go wrong in every way a fit might."""
+"""Jobs that go wrong in every way a fit or a diagnosis might."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import time
 from dataclasses import replace
 from typing import Any
 
+from valveflow_ros.errors import DataError
+from valveflow_ros.monitoring.events import DiagnosisContent
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node.engine import example_curve
 
@@ -30,9 +32,12 @@ def raises(task: Any) -> Any:
 
 def refuses(task: Any) -> Any:
     """Refuse the data as `fit` does."""
-    from valveflow_ros.errors import DataError
-
     raise DataError('There is no curve in these data.')
+
+
+def greedy(task: Any) -> Any:
+    """Ask for more memory than there is."""
+    raise MemoryError
 
 
 def hangs(task: Any) -> Any:
@@ -62,51 +67,46 @@ def writes_nonsense(task: Any) -> Any:
     time.sleep(3600.0)
 
 
+def nothing(task: Any) -> Any:
+    """Give no result at all."""
+
+
 def nan(task: Any) -> Any:
-    """Give a slope that is no number."""
-    curve = good(task)
-    return replace(curve, pieces=(replace(curve.pieces[0], slope=float('nan')), curve.pieces[1]))
+    first, second = good(task).pieces
+    return replace(good(task), pieces=(replace(first, slope=float('nan')), second))
 
 
 def backwards(task: Any) -> Any:
-    """Give breakpoints that do not increase."""
-    curve = good(task)
-    return replace(curve, pieces=(curve.pieces[1], curve.pieces[0]))
+    return replace(good(task), pieces=good(task).pieces[::-1])
 
 
 def of_other_data(task: Any) -> Any:
-    """Answer for a window that was not asked about."""
-    curve = good(task)
-    return replace(curve, source=replace(curve.source, window_end_ns=1)).with_id()
+    return replace(good(task), source=example_curve(Settings()).source).with_id()
 
 
 def renamed(task: Any) -> Any:
-    """Give a curve under another curve's name."""
     return replace(good(task), model_id='000000000000')
 
 
-def nothing(task: Any) -> Any:
-    """Give no curve at all."""
-    return None
-
-
-def greedy(task: Any) -> Any:
-    """Ask for more memory than there is."""
-    raise MemoryError
-
-
-ALL = (good, raises, refuses, greedy, nothing, nan, backwards, of_other_data, renamed, prints)
-
-
 def told(task: Any) -> Any:
-    """Do the one of `ALL` whose number is the task's name."""
-    return ALL[task.request_ns](task)
+    """Do the one of `BAD_FITS` whose number is the task's name, or `prints`."""
+    return [*BAD_FITS, prints][task.request_ns](task)
+
+
+BAD_FITS = {
+    raises: 'failed unexpectedly: a fault (ZeroDivisionError, hurt_jobs.py, line',
+    refuses: 'There is no curve in these data.',
+    greedy: 'more memory than there is',
+    nothing: 'gave no curve',
+    nan: 'a curve that cannot be',
+    backwards: 'a curve that cannot be',
+    of_other_data: 'other data',
+    renamed: 'its own name',
+}
 
 
 def diagnosed(task: Any) -> Any:
     """Return a small diagnosis at once."""
-    from valveflow_ros.monitoring.events import DiagnosisContent
-
     content = {
         'verdict': 'nothing', 'sentence': 'The model explains the unit.', 'causes': [],
         'not_told_apart': [], 'unexplained_by': [], 'rejected': [], 'disturbance': None,
@@ -115,18 +115,24 @@ def diagnosed(task: Any) -> Any:
     return DiagnosisContent(task.window_end_ns, json.dumps(content))
 
 
-def diagnosed_other_data(task: Any) -> Any:
-    """Answer for a window that was not asked about."""
-    return replace(diagnosed(task), window_end_ns=1)
-
-
 def no_verdict(task: Any) -> Any:
-    """Give a verdict that does not exist."""
     content = diagnosed(task)
     return replace(content, text=content.text.replace('nothing', 'perhaps'))
 
 
+def diagnosed_other_data(task: Any) -> Any:
+    return replace(diagnosed(task), window_end_ns=1)
+
+
 def half(task: Any) -> Any:
-    """Give half of a result."""
-    content = diagnosed(task)
-    return replace(content, text='{"verdict": "named", "sentence": "Something."}')
+    return replace(diagnosed(task), text='{"verdict": "named", "sentence": "Something."}')
+
+
+BAD_DIAGNOSES = {
+    raises: 'The diagnosis failed unexpectedly: a fault (ZeroDivisionError',
+    refuses: 'There is no curve in these data.',
+    nothing: 'gave no result',
+    diagnosed_other_data: 'answered for other data',
+    no_verdict: 'gave no verdict',
+    half: 'cannot be checked (KeyError)',
+}

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,21 @@ class Listener:
         self.node = Node(name, context=context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
-        self.alarms: list[Alarm] = []
-        self.curves: list[FlowCharacteristic] = []
+        self.alarms = self.latched(Alarm, 'alarms')
+        self.curves = self.latched(FlowCharacteristic, 'characteristic')
         self.health: list[DiagnosticArray] = []
-        subscribe = self.node.create_subscription
-        subscribe(Alarm, f'{MONITOR}/alarms', self.alarms.append, LATCHED)
-        subscribe(FlowCharacteristic, f'{MONITOR}/characteristic', self.curves.append, LATCHED)
-        subscribe(DiagnosticArray, '/diagnostics', self.health.append, 10)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self.health.append, 10)
+
+    def latched(self, kind: Any, name: str) -> list[Any]:
+        """Return the list into which a latched topic is heard from now on."""
+        heard: list[Any] = []
+        self.node.create_subscription(kind, f'{MONITOR}/{name}', heard.append, LATCHED)
+        return heard
+
+    def late(self, kind: Any, name: str) -> Any:
+        """Come late to a latched topic; return its first message."""
+        heard = self.latched(kind, name)
+        return self.until(lambda: heard and heard[0], name)
 
     def until(self, condition: Any, what: str, patience_s: float = PATIENCE_S) -> Any:
         """Listen until something holds; return it."""
@@ -42,31 +51,31 @@ class Listener:
             lambda: self.executor.spin_once(timeout_sec=0.02) or condition(), what, patience_s
         )
 
+    def quiet(self, seconds: float) -> None:
+        """Listen for a while."""
+        until_s = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > until_s, 'the end of a while')
+
     def call(self, kind: Any, name: str, request: Any) -> Any:
         client = self.node.create_client(kind, f'{MONITOR}/{name}')
         self.until(client.service_is_ready, name)
         future = client.call_async(request)
         return self.until(lambda: future.done() and future.result(), name)
 
-    def trigger(self, name: str) -> Trigger.Response:
-        return self.call(Trigger, name, Trigger.Request())
+    def trigger(self, name: str) -> tuple[bool, str]:
+        """Ask a service; return success and sentence."""
+        answer = self.call(Trigger, name, Trigger.Request())
+        return answer.success, answer.message
 
-    def latched(self, kind: Any, name: str) -> Any:
-        """Come late to a latched topic."""
-        heard: list[Any] = []
-        self.node.create_subscription(kind, f'{MONITOR}/{name}', heard.append, LATCHED)
-        return self.until(lambda: heard and heard[0], name)
-
-    def item(self, name: str) -> dict[str, str]:
-        """Return the numbers of an item of the newest health."""
-        for status in self.health[-1].status if self.health else []:
-            if status.name.endswith(name):
-                return {entry.key: entry.value for entry in status.values}
-        return {}
+    def status(self, item: str) -> Any:
+        """Return an item of the newest health, None if there is none."""
+        newest = self.health[-1].status if self.health else []
+        return next((status for status in newest if status.name.endswith(item)), None)
 
     def value(self, item: str, key: str) -> str:
         """Return a number of the newest health."""
-        return self.item(item).get(key, '')
+        found = self.status(item)
+        return {v.key: v.value for v in found.values}.get(key, '') if found else ''
 
     def close(self) -> None:
         self.executor.shutdown()
@@ -88,3 +97,12 @@ def start_plant(processes: Processes, **parameters: object) -> Any:
     """Start a plant that runs as fast as the monitor takes it."""
     given = {'seed': 7, 'rate': 0.0, 'wait': PATIENCE_S, **parameters}
     return processes.start('valveflow_ros.ros.simulator_main', *ros_arguments(given))
+
+
+def ended(processes: Processes, monitor: Any, limit_s: float = 20.0) -> str:
+    """End a monitor in order; return what it said."""
+    monitor.terminate()
+    said = processes.output
+    assert monitor.wait(limit_s) == 0, said(monitor)
+    assert 'Traceback' not in said(monitor)
+    return said(monitor)

@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting for events, and processes that are ended."""
+"""Waiting for events, processes that are ended, and the sockets they hold."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 # The limit for waiting on an event: the first run compiles, and the machine may be busy.
 PATIENCE_S = 240.0
+LOOPBACK = '127.0.0.1'
 
 
 def wait_until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
@@ -61,3 +63,13 @@ class Processes:
             if process.poll() is None:
                 process.kill()
                 process.wait()
+
+
+def bound(process: psutil.Process) -> list[tuple[str, int]]:
+    """Return address and port of each internet socket of a process."""
+    return [tuple(found.laddr) for found in process.net_connections('inet') if found.laddr]
+
+
+def rtps_ports(domain: int) -> range:
+    """Return the ports that DDS gives to a domain (OMG DDSI-RTPS 9.6.1)."""
+    return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import itertools
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,23 +12,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from listener import LATCHED, MONITOR, Listener, start_monitor
+from listener import Listener, ended, start_monitor
 from rclpy.parameter import Parameter
 from ros_helpers import Processes
 from valveflow_msgs.msg import Diagnosis
 
 import valveflow_ros as vf
-from valveflow_ros.cli.main import main
 from valveflow_ros.errors import ParameterError
 from valveflow_ros.interface.logs import read_covariate
 from valveflow_ros.logs import open_log
 from valveflow_ros.records import SIGNALS
+from valveflow_ros.ros.decoding import from_time
 from valveflow_ros.ros.encoding import float64_bytes
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.player import Player, Step
 from valveflow_ros.ros.replay_main import steps_of
 from valveflow_ros.ros.verify import verify
 
+pytestmark = pytest.mark.ros
 TOPIC, COLUMN = '/condenser/pressure', 'condenser_pressure_kpa'
 REQUIRED = [info for info in SIGNALS if info.required]
 ROWS = 3600
@@ -38,35 +38,39 @@ MINUTES = {
     'hold_limit': 150.0, 'lateness': 60.0, 'block': 60.0, 'alarm_block': 120.0,
     'refit_period': 86400.0, 'diagnosis_hour': -1, 'diagnosis_on_mismatch': False,
     'reference_after': 0.0, 'use_sim_time': True, 'state_period': 1.0,
-    'diagnostics_period': 0.2,
+    'diagnostics_period': 0.2, 'unit_tag': 'unit 1',
 }  # fmt: skip
+
+
+def times_of(frame: Any) -> list[int]:
+    return frame['time'].dt.tz_convert(None).to_numpy('datetime64[ns]').astype(np.int64).tolist()
 
 
 def steps(frame: Any) -> Iterator[Step]:
     """Yield the rows of a plant; every tenth value of the covariate is NaN."""
-    times = frame['time'].dt.tz_convert(None).to_numpy('datetime64[ns]').astype(np.int64)
-    for k, time_ns in enumerate(times.tolist()):
+    for k, time_ns in enumerate(times_of(frame)):
         value = np.nan if k % 10 == 0 else frame[COLUMN].iloc[k]
         row = [(info.topic, float64_bytes(frame[info.column].iloc[k])) for info in REQUIRED]
         yield Step(time_ns, [(TOPIC, float64_bytes(value)), *row])
 
 
-@pytest.mark.ros
 @pytest.mark.slow
 def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
-    processes: Processes, context: Any, tmp_path: Path
+    processes: Processes, listener: Listener, tmp_path: Path
 ) -> None:
     plant = vf.simulate(days=2.5, seed=3, unit='choked:number=3', recording='minute')
     frame = plant.to_dataframe()
     monitor = start_monitor(processes, tmp_path / 'recordings', **MINUTES)
-    listener = Listener(context)
     names = [TOPIC, *(info.topic for info in REQUIRED)]
     player = Player(listener.node, names, 0.0, True, lambda: False)
     played = steps(frame)
+
+    def taken() -> int:
+        return int(listener.value('fit', 'Samples taken in all runs') or 0)
+
     assert player.wait_for_listeners(240.0) == []
     player.play(itertools.islice(played, ROWS // 2))
-    taken = 'Samples taken in all runs'
-    listener.until(lambda: int(listener.value('fit', taken) or 0) > ROWS // 2 - 5, 'half of it')
+    listener.until(lambda: taken() > ROWS // 2 - 5, 'half of it')
     # Health is published five times a second: a state as young as that has all of these samples.
     begun_s, age = time.monotonic(), 'Seconds since it was saved'
     listener.until(
@@ -81,30 +85,34 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
     listener.health.clear()
     assert player.wait_for_listeners(240.0) == []
     player.play(played)
-    listener.until(lambda: int(listener.value('fit', taken) or 0) > ROWS - 50, 'all of it')
-    found: list[Diagnosis] = []
-    listener.node.create_subscription(Diagnosis, f'{MONITOR}/diagnosis', found.append, LATCHED)
-    assert listener.trigger('diagnose').success
-    listener.until(lambda: found and found[-1].causes, 'the diagnosis')
-    (cause,) = found[-1].causes
-    assert cause.name == 'vacuum'
+    listener.until(lambda: taken() > ROWS - 50, 'all of it')
+    assert listener.trigger('diagnose')[0]
+    heard = listener.latched(Diagnosis, 'diagnosis')
+    listener.until(lambda: heard and heard[-1].causes, 'the diagnosis')
+    found = heard[-1]
+    assert repr(listener.late(Diagnosis, 'diagnosis')) == repr(found)
+    assert (found.verdict, found.header.frame_id) == (Diagnosis.NAMED, 'unit 1')
+    assert found.model_id == listener.curves[-1].model_id
+    assert from_time(found.header.stamp) > times_of(frame)[-50]
+    assert found.rmse_extended < found.rmse_simulation
+    (cause,) = found.causes
+    assert (cause.name, bool(cause.meaning)) == ('vacuum', True)
     truth = plant.data.unit.vacuum_per_kpa * frame['generated_power_mw'].mean()
     b = cause.parameter_values[list(cause.parameter_names).index('b')]
     assert b == pytest.approx(truth, rel=0.1)
     assert f'for every kPa that {TOPIC} (vacuum) is higher' in cause.sentence
 
-    def told(name: str) -> tuple[bytes, str]:
-        items = {s.name.partition(': ')[2]: s for s in listener.health[-1].status}
-        return items[f'input covariate {name}'].level, items[f'input covariate {name}'].message
+    ambient = listener.status('input covariate ambient')
+    told = '/weather/temperature is not sent; it is optional.'
+    assert (ambient.level, ambient.message) == (b'\x00', told)
 
-    assert told('ambient') == (b'\x00', '/weather/temperature is not sent; it is optional.')
-    listener.until(lambda: 'has been silent for' in told('vacuum')[1], 'the silence')
-    level, sentence = told('vacuum')
-    assert level == b'\x00'
-    assert sentence.endswith(' s; it is optional.')
-    monitor.send_signal(signal.SIGTERM)
-    assert monitor.wait(20.0) == 0, processes.output(monitor)
-    listener.close()
+    def silent() -> bool:
+        status = listener.status('input covariate vacuum')
+        told = status.message.startswith(f'{TOPIC} has been silent for')
+        return told and status.message.endswith(' s; it is optional.') and status.level == b'\x00'
+
+    listener.until(silent, 'the silence')
+    ended(processes, monitor)
 
     (folder,) = (tmp_path / 'recordings').glob('valveflow_*')
     result = verify(folder)
@@ -117,13 +125,8 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
     inputs, again = steps_of(open_log(folder))
     assert inputs[0] == TOPIC
     assert [name for name, _ in next(again).messages] == names
-    out = str(tmp_path / 'why')
-    words = ['diagnose', str(folder), '-o', out, '--quiet', '--covariate', f'vacuum={TOPIC}']
-    assert main(words) == 0
-    assert '"vacuum"' in (tmp_path / 'why' / 'diagnosis.json').read_text()
 
 
-@pytest.mark.ros
 @pytest.mark.parametrize(
     ('text', 'sentence'),
     [

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def joined(count: int, *neighbours: str) -> Any:
     return (*first, *second)
 
 
-@pytest.mark.parametrize('count', [0, 1, 5])
+@pytest.mark.parametrize('count', [0, 5])
 def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(
     context: Context, count: int
 ) -> None:
@@ -102,7 +103,31 @@ class Told:
         self.there = False
 
 
-@pytest.mark.usefixtures('ros_environment', 'here')
+class Graph:
+    """Makes nodes that are said to have heard of others; None where one cannot be made."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Told] = []
+        self.heard: list[list[str] | None] = [[]] * 5
+
+    def create(self, name: str, context: Context, **more: Any) -> Told:
+        heard = self.heard[len(self.nodes)]
+        if heard is None:
+            raise RuntimeError('no more nodes')
+        self.nodes.append(Told(context, heard))
+        return self.nodes[-1]
+
+
+@pytest.fixture
+def graph(
+    monkeypatch: pytest.MonkeyPatch, ros_environment: dict[str, str], here: None
+) -> Iterator[Graph]:
+    made = Graph()
+    monkeypatch.setattr(rclpy, 'create_node', made.create)
+    yield made
+    assert not rclpy.ok()
+
+
 @pytest.mark.parametrize(
     ('heard', 'best'),
     [
@@ -116,15 +141,10 @@ class Told:
     ],
 )
 def test_it_goes_on_as_the_one_that_heard_of_most(
-    monkeypatch: pytest.MonkeyPatch, heard: list[list[str]], best: int
+    graph: Graph, heard: list[list[str] | None], best: int
 ) -> None:
-    made: list[Told] = []
-
-    def create(name: str, context: Context, **more: Any) -> Told:
-        made.append(Told(context, heard[len(made)]))
-        return made[-1]
-
-    monkeypatch.setattr(rclpy, 'create_node', create)
+    graph.heard = heard
+    made = graph.nodes
     presence = Presence([], count=len(heard))
     chosen = presence.settle()
     assert chosen is made[best].context
@@ -138,28 +158,15 @@ def test_it_goes_on_as_the_one_that_heard_of_most(
     assert not any(node.context.ok() for node in made)
 
 
-@pytest.mark.usefixtures('ros_environment', 'here')
 @pytest.mark.parametrize('failing', [1, 2])
-def test_where_one_more_cannot_be_made_those_before_will_do(
-    monkeypatch: pytest.MonkeyPatch, failing: int
-) -> None:
-    made: list[Told] = []
-
-    def create(name: str, context: Context, **more: Any) -> Told:
-        if len(made) + 1 == failing:
-            raise RuntimeError('no more nodes')
-        made.append(Told(context, []))
-        return made[-1]
-
-    monkeypatch.setattr(rclpy, 'create_node', create)
+def test_where_one_more_cannot_be_made_those_before_will_do(graph: Graph, failing: int) -> None:
+    graph.heard[failing - 1] = None
     presence = Presence([], count=5)
-    assert len(made) == failing - 1
+    assert len(graph.nodes) == failing - 1
     assert presence.settle().ok()
     presence.close()
-    assert not rclpy.ok()
 
 
-@pytest.mark.usefixtures('ros_environment', 'here')
 @pytest.mark.parametrize(
     ('middleware', 'environ', 'shown'),
     [
@@ -170,22 +177,18 @@ def test_where_one_more_cannot_be_made_those_before_will_do(
     ],
 )
 def test_it_shows_itself_only_where_that_helps_and_is_allowed(
-    monkeypatch: pytest.MonkeyPatch, middleware: str, environ: dict[str, str], shown: int
+    graph: Graph,
+    monkeypatch: pytest.MonkeyPatch,
+    middleware: str,
+    environ: dict[str, str],
+    shown: int,
 ) -> None:
-    made: list[Told] = []
-
-    def create(name: str, context: Context, **more: Any) -> Told:
-        made.append(Told(context, []))
-        return made[-1]
-
     name = 'valveflow_ros.ros.domain.get_rmw_implementation_identifier'
     monkeypatch.setattr(name, lambda: middleware)
-    monkeypatch.setattr(rclpy, 'create_node', create)
     presence = Presence([], environ=environ)
-    assert len(made) == shown
+    assert len(graph.nodes) == shown
     assert presence.settle().ok()
     presence.close()
-    assert not rclpy.ok()
 
 
 @pytest.mark.usefixtures('ros_environment', 'here')
@@ -227,20 +230,18 @@ def test_signals_cut_only_where_they_may_and_only_once() -> None:
         pytest.fail('begun after a signal')
     os.kill(os.getpid(), signal.SIGTERM)
     wait_until(lambda: stop.name == 'SIGTERM', 'the third signal', 20.0)
-
-
-@pytest.mark.usefixtures('here')
-def test_an_error_closes_the_door_to_signals() -> None:
     stop = StopFlag().install()
     with pytest.raises(ImportError), stop.cutting():
         raise ImportError
+    # An error closes the door, too.
     os.kill(os.getpid(), signal.SIGINT)
-    wait_until(lambda: bool(stop), 'the signal', 20.0)
+    wait_until(lambda: stop.name == 'SIGINT', 'the last signal', 20.0)
 
 
 # Transport: sockets, so that a killed process leaves no shared memory that others go on using
 
 FAST_DDS = 'rmw_fastrtps_cpp'
+SOCKETS = 'UDPv4?sockets_size=4MB'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
@@ -264,19 +265,19 @@ def chosen(**given: str) -> dict[str, str]:
     return environ
 
 
-@pytest.mark.parametrize('name', [TRANSPORTS, *PROFILES])
 @pytest.mark.parametrize('reach', ['LOCALHOST', 'SUBNET'])
-def test_who_has_chosen_keeps_the_choice(name: str, reach: str) -> None:
-    given = {name: 'SHM', RANGE: reach}
-    assert chosen(**given) == given
-
-
 @pytest.mark.parametrize(
-    'name', ['ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER']
+    ('name', 'value'),
+    [
+        *((name, 'SHM') for name in (TRANSPORTS, *PROFILES)),
+        # Discovery of another kind.
+        *((f'ROS_{name}', '1') for name in ('LOCALHOST_ONLY', 'STATIC_PEERS', 'DISCOVERY_SERVER')),
+    ],
 )
-def test_discovery_of_another_kind_is_left_alone(name: str) -> None:
-    given = {name: '1', RANGE: 'LOCALHOST'}
-    assert chosen(**given) == given
+def test_who_has_chosen_keeps_the_choice(name: str, value: str, reach: str) -> None:
+    given = {name: value, RANGE: reach}
+    kept = value == 'SHM' or reach == 'LOCALHOST'
+    assert chosen(**given) == (given if kept else {**given, TRANSPORTS: SOCKETS})
 
 
 @pytest.mark.parametrize('reach', ['LOCALHOST', 'SUBNET', ''])
@@ -288,7 +289,7 @@ def test_another_middleware_is_left_alone(reach: str) -> None:
 
 @pytest.mark.parametrize('reach', ['', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'])
 def test_the_reach_stays_as_it_was(reach: str) -> None:
-    assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: 'UDPv4?sockets_size=4MB'}
+    assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: SOCKETS}
 
 
 def test_on_one_host_the_profile_takes_the_place_of_the_limit() -> None:
@@ -299,8 +300,10 @@ def test_on_one_host_the_profile_takes_the_place_of_the_limit() -> None:
     assert '<address>127.0.0.1</address>' in Path(profile).read_text()
 
 
-@pytest.mark.parametrize('reach', ['LOCALHOST', 'SUBNET'])
-@pytest.mark.parametrize(('transports', 'shared'), [('', False), ('DEFAULT', True)])
+@pytest.mark.parametrize(
+    ('transports', 'shared', 'reach'),
+    [('', False, 'LOCALHOST'), ('', False, 'SUBNET'), ('DEFAULT', True, 'SUBNET')],
+)
 def test_a_node_maps_no_shared_memory_unless_that_is_asked_for(
     transports: str, shared: bool, reach: str
 ) -> None:

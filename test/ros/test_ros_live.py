@@ -4,52 +4,73 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import hurt_jobs
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
-from valveflow_msgs.msg import Alarm
+from ros_helpers import wait_until
+from std_msgs.msg import Float64MultiArray
+from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
+from valveflow_msgs.msg import JournalEntry as JournalMessage
 
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import Alarms, ResidualAlarm, ShiftAlarm
-from valveflow_ros.monitoring.events import CurveAdopted, Event, JournalEntry, JournalKind
+from valveflow_ros.monitoring.events import (
+    CurveAdopted,
+    Diagnosed,
+    DiagnosisRequested,
+    DiagnosisTask,
+    Event,
+    JournalEntry,
+    JournalKind,
+    ReferenceSet,
+)
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
-from valveflow_ros.records import NS_PER_S, Readings, table_to_readings
-from valveflow_ros.ros.decoding import Row, from_time
-from valveflow_ros.ros.node.engine import LiveEngine
+from valveflow_ros.plant.unit import UnitDescription
+from valveflow_ros.records import NS_PER_S, Readings, table_to_readings, zone_of
+from valveflow_ros.ros import encoding
+from valveflow_ros.ros.decoding import Row, from_time, journal_entry
+from valveflow_ros.ros.node.diagnostics import Level
+from valveflow_ros.ros.node.engine import LiveEngine, example_curve, example_task
+from valveflow_ros.ros.node.health import diagnosis_item
 from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
-from valveflow_ros.ros.node.worker import WorkerResult
+from valveflow_ros.ros.node.worker import DiagnosisWorker, WorkerResult
 from valveflow_ros.ros.simulator_main import effects_of
 from valveflow_ros.signals.align import Aligner
+from valveflow_ros.signals.static_form import OPENING
 
 SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_delay': 60.0})
-TABLE = simulate(0.3, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.25'])).table
+TABLE = simulate(0.24, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.17'])).table
+REFERENCE = example_curve(SETTINGS).with_id()
+DEAD = 'The fit process ended unexpectedly (signal SIGKILL).'
+Calls = list[list[Event]]
 
 
 class SlowWorker:
-    """Gives outcomes a number of looks after they were asked for."""
+    """Gives outcomes a number of looks after they were asked for; may lose one fit."""
 
-    def __init__(self, looks: int) -> None:
-        self._looks = looks
+    def __init__(self, looks: int, lost: int = -1) -> None:
+        self._looks, self._lost = looks, lost
         self._waiting: list[tuple[int, WorkerResult]] = []
-        self._look = 0
-        self.refuse_next = False
+        self._look = self._count = 0
 
-    def submit(self, task: object) -> None:
-        if self.refuse_next:
-            self.refuse_next = False
-            result: object = 'The fit process ended unexpectedly (signal SIGKILL).'
-        else:
-            try:
-                result = fit(task)  # type: ignore[arg-type]
-            except DataError as error:
-                result = str(error)
-        outcome = WorkerResult(task.request_ns, result, 0.5)  # type: ignore[attr-defined,arg-type]
+    def submit(self, task: Any) -> None:
+        self._count += 1
+        try:
+            result = DEAD if self._count == self._lost else fit(task)
+        except DataError as error:
+            result = str(error)
+        outcome = WorkerResult(task.request_ns, result, 0.5)
         self._waiting.append((self._look + self._looks, outcome))
 
     def poll(self) -> list[WorkerResult]:
@@ -65,82 +86,93 @@ def rows_of(readings: Readings) -> list[Row]:
 
 
 ROWS = rows_of(table_to_readings(TABLE))
+# At the end the clock goes back by hours.
+ROWS[-4000:] = [(t - 10**13, *rest) for t, *rest in ROWS[-4000:]]  # type: ignore[misc]
 
 
-def run(
-    cuts: list[int], worker: SlowWorker, engine: LiveEngine, rows: list[Row] = ROWS
-) -> list[list[Event]]:
-    """Feed all rows cut at ``cuts``; return the events of each call."""
-    calls: list[list[Event]] = []
-    for start, end in zip([0, *cuts], [*cuts, len(rows)], strict=True):
-        calls += [engine.poll(), engine.feed(rows[start:end])]
+def run(engine: LiveEngine, size: int, rows: list[Row]) -> Calls:
+    """Feed all rows cut evenly; return the events of each call."""
+    calls: Calls = []
+    for start in range(0, len(rows), size):
+        calls += [engine.poll(), engine.feed(rows[start : start + size])]
     return calls
 
 
-def said(calls: list[list[Event]]) -> list[Output]:
-    outputs = Outputs('u')
-    found = list(outputs.latched())
-    for events in calls:
-        found += outputs.of(events)
-    return found
+def said(calls: Calls, **more: Any) -> list[Output]:
+    outputs = Outputs('u', **more)
+    return [*outputs.latched(), *(output for events in calls for output in outputs.of(events))]
 
 
-def evenly(size: int, rows: list[Row] = ROWS) -> list[int]:
-    return list(range(size, len(rows), size))
+def messages(found: list[Output], kind: Any, name: str) -> list[Any]:
+    return [deserialize_message(o.data, kind) for o in found if o.name == name]
 
 
 @pytest.fixture(scope='module')
-def live() -> tuple[LiveEngine, list[list[Event]]]:
-    worker = SlowWorker(3)
-    engine = LiveEngine(SETTINGS, worker)
-    return engine, run(evenly(500), worker, engine)
+def live() -> tuple[LiveEngine, Calls]:
+    """A fault, a lost fit, an alarm that is acknowledged, two references, a clock set back."""
+    engine = LiveEngine(SETTINGS, SlowWorker(3, lost=3))  # type: ignore[arg-type]
+    calls = [engine.monitor.set_reference(REFERENCE), *run(engine, 500, ROWS[:-5000])]
+    calls.append(engine.monitor.operate_alarms(AlarmAction.ACKNOWLEDGE))
+    calls.append(engine.monitor.set_reference())
+    return engine, [*calls, *run(engine, 500, ROWS[-5000:])]
 
 
-def test_it_does_what_it_is_for(live: tuple[LiveEngine, list[list[Event]]]) -> None:
+def test_all_that_happens_is_told(live: tuple[LiveEngine, Calls]) -> None:
     engine, calls = live
-    events = [event for call in calls for event in call]
-    assert any(isinstance(event, CurveAdopted) for event in events)
-    assert engine.monitor.rows == len(TABLE)
+    found = said(calls)
+    assert {output.name for output in found} == set(OUTPUTS)
     assert engine.last_fit_s == 0.5
-    names = {output.name for output in said(calls)}
-    assert names == set(OUTPUTS)
+    kinds = [e.kind for events in calls for e in events if isinstance(e, JournalEntry)]
+    assert kinds.count(JournalKind.SET_REFERENCE) == 2
+    assert kinds.count(JournalKind.RESET) == 1
+    assert {JournalKind.FIT_ADOPTED, JournalKind.ACKNOWLEDGE} <= set(kinds)
+    # A fit that fails leaves the curve as stale with the sentence.
+    curves = messages(found, FlowCharacteristic, 'characteristic')
+    stale, *_ = (c for c in curves if c.cause == DEAD)
+    assert (stale.status, len(stale.slopes) > 0) == (FlowCharacteristic.STALE, True)
+    states = [a.state for a in messages(found, Alarm, 'alarms') if a.name == 'residual']
+    assert {Alarm.UNACKNOWLEDGED, Alarm.ACKNOWLEDGED} <= set(states)
 
 
 @pytest.mark.parametrize('begun_ns', [DEFAULT_START_NS - NS_PER_S, 0])
 def test_who_comes_late_finds_everything_with_a_time(
-    live: tuple[LiveEngine, list[list[Event]]], begun_ns: int
+    live: tuple[LiveEngine, Calls], begun_ns: int
 ) -> None:
     _, calls = live
     outputs = Outputs('u', begun_ns=begun_ns)
     first = list(outputs.latched())
-    later = [output for events in calls for output in outputs.of(events)]
     if not begun_ns:
         # No time yet; they come again with the first row.
         assert {output.time_ns for output in first} == {0}
-        again, later = later[: len(first)], later[len(first) :]
-        assert [output.name for output in again] == [output.name for output in first]
-        first = again
-    assert {output.time_ns for output in first} == {begun_ns or later[0].time_ns}
+        later = (output for events in calls[1:] for output in outputs.of(events))
+        again = [output for output in itertools.islice(later, 60) if output.name != 'journal']
+        assert [o.name for o in again[: len(first)]] == [o.name for o in first]
+        first, begun_ns = again[: len(first)], again[len(first)].time_ns
+    assert {output.time_ns for output in first} == {begun_ns}
     assert {output.name for output in first} == {n for n, o in OUTPUTS.items() if o.latched}
     for output in first:
         message = deserialize_message(output.data, OUTPUTS[output.name].message_type)
         if output.name not in ('breakpoints', 'slopes'):
             assert from_time(message.header.stamp) == output.time_ns
-    told = [deserialize_message(o.data, Alarm) for o in first if o.name == 'alarms']
+    told = messages(first, Alarm, 'alarms')
     assert {alarm.name for alarm in told} == {'residual', 'curve_shift'}
-    assert {alarm.sentence for alarm in told} == {'The alarm was not raised since the start.'}
-    assert {(a.state, a.previous_state, a.occurrence) for a in told} == {
-        (Alarm.NORMAL,) * 2 + (0,)
-    }
+    for alarm in told:
+        assert alarm.sentence == 'The alarm was not raised since the start.'
+        assert (alarm.state, alarm.previous_state, alarm.occurrence) == (Alarm.NORMAL,) * 2 + (0,)
 
 
 def test_replaying_the_journal_says_the_same_byte_for_byte(
-    live: tuple[LiveEngine, list[list[Event]]],
+    live: tuple[LiveEngine, Calls],
 ) -> None:
     _, calls = live
     expected = said(calls)
-    journal = [e for call in calls for e in call if isinstance(e, JournalEntry)]
-    table = Aligner(SETTINGS).feed(table_to_readings(TABLE)).table
+    # Through messages and back, as a recording keeps the journal.
+    journal = [
+        journal_entry(encoding.encode(encoding.journal_message(e, 'u')))
+        for events in calls for e in events if isinstance(e, JournalEntry)
+    ]  # fmt: skip
+    table = Aligner(SETTINGS).feed(Readings.of(ROWS)).table
+    assert np.diff(table.time_ns).min() < 0
     for size in (len(table), 1777):
         replayer = JournalReplayer(Monitor(SETTINGS), journal)
         again = [
@@ -150,51 +182,30 @@ def test_replaying_the_journal_says_the_same_byte_for_byte(
         assert said(again) == expected
 
 
+@pytest.mark.parametrize(
+    ('kind', 'words'),
+    [
+        (JournalKind.SET_REFERENCE, 'no curve that could become the reference'),
+        (JournalKind.DIAGNOSED, 'never asked for'),
+    ],
+)
+def test_what_cannot_be_replayed_is_said(kind: JournalKind, words: str) -> None:
+    entry = JournalEntry(0, kind, 5, 0, 'x', '')
+    with pytest.raises(DataError, match=words):
+        JournalReplayer(Monitor(SETTINGS), [entry]).feed(TABLE.part(0, 3))
+
+
 def test_the_cutting_of_the_stream_leaves_no_trace() -> None:
     # With an outcome at the next look, a call per row or many rows differ in the boundary at
     # which it is adopted; without fits nothing may differ at all.
     settings = SETTINGS.changed({'refit_period': 0.0})
-    rows = ROWS[: len(ROWS) // 2]
+    rows = ROWS[: len(ROWS) // 4]
     found = []
-    for size in (7, 5000, len(rows), 500):
-        worker = SlowWorker(0)
-        engine = LiveEngine(settings, worker)
-        found.append(said(run(evenly(size, rows), worker, engine, rows)))
+    for size in (7, 500, len(rows)):
+        engine = LiveEngine(settings, SlowWorker(0))  # type: ignore[arg-type]
+        found.append(said(run(engine, size, rows)))
     assert all(one == found[0] for one in found[1:])
-    assert len(found[0]) >= len(TABLE) // 2
-
-
-def test_a_fit_that_fails_leaves_the_curve_as_stale_with_the_sentence() -> None:
-    worker = SlowWorker(1)
-    engine = LiveEngine(SETTINGS, worker)
-    outputs = Outputs('u')
-    cuts = evenly(5 * 600)
-    for k, (start, end) in enumerate(zip([0, *cuts], [*cuts, len(ROWS)], strict=True)):
-        for events in (engine.poll(), engine.feed(ROWS[start:end])):
-            list(outputs.of(events))
-        if outputs.curve is not None and k % 2 == 0:
-            worker.refuse_next = True
-        if outputs.cause and outputs.curve is not None:
-            break
-    assert 'ended unexpectedly' in outputs.cause
-    assert (outputs.status, outputs.cause) == (engine.monitor.status, engine.monitor.cause)
-    assert outputs.status.name == 'STALE'
-
-
-def test_a_clock_that_goes_back_restarts_the_engine_and_is_journaled() -> None:
-    worker = SlowWorker(0)
-    engine = LiveEngine(SETTINGS, worker)
-    calls = [engine.feed(ROWS[:20_000]), engine.poll(), engine.feed(ROWS[20_000:30_000])]
-    again = [(t - 10**13, *rest) for t, *rest in ROWS[30_000:34_000]]
-    calls += [engine.poll(), engine.feed(again)]  # type: ignore[arg-type]
-    journal = [e for call in calls for e in call if isinstance(e, JournalEntry)]
-    resets = [entry for entry in journal if entry.kind == JournalKind.RESET]
-    assert len(resets) == 1
-    aligned = Aligner(SETTINGS)
-    table = aligned.feed(Readings.of([*ROWS[:30_000], *again])).table  # type: ignore[list-item]
-    replayer = JournalReplayer(Monitor(SETTINGS), journal)
-    assert said([replayer.feed(table)]) == said(calls)
-    assert np.diff(table.time_ns).min() < 0
+    assert len(found[0]) >= len(TABLE) // 4
 
 
 def test_who_comes_late_finds_every_alarm_that_stands_among_what_is_kept() -> None:
@@ -209,7 +220,7 @@ def test_who_comes_late_finds_every_alarm_that_stands_among_what_is_kept() -> No
     time_ns = DEFAULT_START_NS + NS_PER_S * np.arange(1, 3601)
     values = np.where(np.arange(3600) % 2, 0.0, 2.0)
     events += [c for _, c in residual.feed(time_ns, values, values, 'm', [shift])]
-    told = [deserialize_message(o.data, Alarm) for o in Outputs('u').of(events)]
+    told = messages([*Outputs('u').of(events)], Alarm, 'alarms')
     kept = OUTPUTS['alarms'].kept
     assert len(told) > 5 * kept
     for k in range(2, len(told)):
@@ -219,10 +230,97 @@ def test_who_comes_late_finds_every_alarm_that_stands_among_what_is_kept() -> No
 
 
 def test_nothing_in_nothing_out() -> None:
-    engine = LiveEngine(SETTINGS, SlowWorker(0))
+    engine = LiveEngine(SETTINGS, SlowWorker(0))  # type: ignore[arg-type]
     assert engine.feed([]) == []
     assert engine.poll() == []
     with pytest.raises(DataError):
         engine.request_fit()
     with pytest.raises(DataError):
         engine.monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
+
+
+def test_the_messages_follow_reference_and_curve() -> None:
+    outputs = Outputs('u')
+    told = list(outputs.of([ReferenceSet(REFERENCE)]))
+    assert [o.name for o in told] == ['characteristic', 'breakpoints', 'slopes']
+    shift = Shift('then', 'now', 1, 1, (), 0, 0, 0, 'It moved.')
+    list(outputs.of([CurveAdopted(REFERENCE, shift)]))
+    assert (outputs.reference_id, outputs.shift) == (REFERENCE.model_id, shift)
+    list(outputs.of([CurveAdopted(REFERENCE)]))
+    assert outputs.shift is None
+
+
+@pytest.mark.parametrize(('axis', 'units'), [
+    ('integrated_input', ['% MPa^e', 'MW / (% MPa^e)']), (OPENING, ['%', 'MW / (% MPa^s)']),
+])  # fmt: skip
+def test_plain_arrays_say_their_unit(axis: str, units: list[str]) -> None:
+    curve = example_curve(SETTINGS)
+    object.__setattr__(curve, 'axis', axis)
+    told = list(Outputs('u').of([CurveAdopted(curve)]))
+    for name, unit in zip(('breakpoints', 'slopes'), units, strict=True):
+        (message,) = messages(told, Float64MultiArray, name)
+        assert message.layout.dim[0].label.endswith(f'[{unit}]')
+
+
+def test_what_a_replay_reads_of_the_journal_is_not_told_in_a_zone() -> None:
+    entry = JournalEntry(0, JournalKind.RESET, 0, 1, '', 'since 2024-01-02 00:30 UTC')
+    told = [*Outputs('u', zone=zone_of('+05:00')).of([entry])]
+    assert messages(told, JournalMessage, 'journal')[0].text == entry.text
+
+
+# Diagnoses; what they find is tested where a real one is computed
+
+STEP_S = 10.0
+DAILY = Settings(
+    {'sample_period': STEP_S, 'refit_period': 28800.0, 'refit_segments': 0, 'diagnosis_hour': 2}
+)
+
+
+def test_no_diagnosis_is_unknown_and_says_why() -> None:
+    contents, curve = example_task(Settings()).contents, REFERENCE
+    task = DiagnosisTask(5, contents, Settings(), curve, int(contents.time_ns[-1]))
+    given = [*Outputs('unit 1').of([Diagnosed(task, '', 'Because.')])], [*Outputs('u').latched()]
+    for told, sentence, model_id, tag in (
+        (given[0], 'Because.', curve.model_id, 'unit 1'), (given[1], encoding.NOT_YET, '', 'u')
+    ):  # fmt: skip
+        (message,) = messages(told, Diagnosis, 'diagnosis')
+        assert (message.verdict, message.sentence) == (Diagnosis.UNKNOWN, sentence)
+        assert (message.model_id, message.header.frame_id) == (model_id, tag)
+        assert np.isnan(message.rmse_simulation)
+
+
+@pytest.mark.usefixtures('jobs_on_path')
+def test_the_night_and_a_hand_bring_a_diagnosis_that_a_replay_repeats() -> None:
+    unit = replace(UnitDescription(), sample_period_s=STEP_S)
+    readings = table_to_readings(simulate(1.25, 5, unit).table)
+    worker = DiagnosisWorker(300.0, 'hurt_jobs:diagnosed')
+    engine = LiveEngine(DAILY, SlowWorker(1), worker)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match='no curve'):
+        engine.request_diagnosis()
+    rows = rows_of(readings)
+    calls = run(engine, 3000, rows[:24_000])
+    with pytest.raises(DataError, match='A diagnosis needs a day of data; the'):
+        engine.request_diagnosis()
+    calls += run(engine, 3000, rows[24_000:])
+    calls.append(wait_until(engine.poll, 'the diagnosis of the night'))
+    calls += [engine.request_diagnosis(), wait_until(engine.poll, 'the diagnosis')]
+    worker.close()
+    asked = [e.task for events in calls for e in events if isinstance(e, DiagnosisRequested)]
+    found = [e for events in calls for e in events if isinstance(e, Diagnosed)]
+    assert [e.task.request_ns for e in found] == [task.request_ns for task in asked]
+    told = said(calls, begun_ns=1)
+    assert len(found) == len(messages(told, Diagnosis, 'diagnosis')) - 1 >= 2
+    assert found[-1].task.window_end_ns == engine.monitor.last_ns
+    assert found[-1].content, found[-1].reason
+    assert len(found[-1].task.contents.time_ns) == 0
+    item = diagnosis_item(engine.monitor, worker, engine.last_diagnosis_s)
+    assert (item.level, item.sentence) == (Level.OK, 'The model explains the unit.')
+    assert (item.values['Verdict'], item.values['Running']) == ('nothing', False)
+    journal = [e for events in calls for e in events if isinstance(e, JournalEntry)]
+
+    def again(task: Any) -> str:
+        return hurt_jobs.diagnosed(task).text
+
+    replayer = JournalReplayer(Monitor(DAILY), journal, again)
+    repeated = replayer.feed(Aligner(DAILY).feed(readings).table)
+    assert said([repeated], begun_ns=1) == told

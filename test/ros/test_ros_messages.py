@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,13 +27,14 @@ from valveflow_msgs.msg import (
 )
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
+from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState, Priority
 from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.monitoring.prediction import PredictionBlock, PredictionState
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import NS_PER_S, Quality, SegmentKind
+from valveflow_ros.records import NS_PER_S, Quality, SegmentKind, zone_of
 from valveflow_ros.records import SpecialSegment as SegmentRecord
 from valveflow_ros.ros import encoding
 from valveflow_ros.ros.decoding import from_time, journal_entry, with_todays_codes
@@ -105,36 +107,59 @@ def test_a_sample_of_before_the_code_for_unknown_is_sent_with_the_codes_of_now()
         with_todays_codes(b'none')
 
 
-def test_every_field_of_a_segment_is_carried_over() -> None:
-    record = SegmentRecord(
+def test_every_field_of_a_segment_and_of_an_alarm_is_carried_over() -> None:
+    segment = SegmentRecord(
         7, SegmentKind.SLOPE, 10**18 + 1, 10**18 + 5, 300, 1.5, 2.5, 0.25, 0.125, 100.0, 110.0,
         0.5, 538.25,
     )  # fmt: skip
-    message = encoding.segment_message(record, 'unit 1')
-    assert message.header.frame_id == 'unit 1'
-    assert from_time(message.header.stamp) == record.end_ns
-    assert from_time(message.start) == record.start_ns
-    assert from_time(message.end) == record.end_ns
-    for name in (
-        'number', 'kind', 'samples', 'u_start', 'u_end', 'u_rate_per_s', 'u_rms',
-        'power_start_mw', 'power_end_mw', 'power_rms_mw', 'temperature_mean_degc',
-    ):  # fmt: skip
-        assert getattr(message, name) == getattr(record, name), name
-
-
-def test_every_field_of_an_alarm_is_carried_over() -> None:
     change = AlarmChange(
         10**18, 'residual', AlarmState.ACKNOWLEDGED, AlarmState.UNACKNOWLEDGED, Priority.HIGH,
         5.5, 4.5, 'MW', 'A sentence.', 3, 10**17, 'abc',
     )  # fmt: skip
-    message = encoding.alarm_message(change, 'u')
-    assert from_time(message.header.stamp) == change.time_ns
-    assert from_time(message.raised) == change.raised_ns
-    assert (message.state, message.previous_state) == (change.state, change.previous)
-    for name in (
-        'name', 'priority', 'value', 'limit', 'unit', 'sentence', 'occurrence', 'model_id',
+    for record, message, others in (
+        (segment, encoding.segment_message(segment, 'u'),
+         {'header': 'end_ns', 'start': 'start_ns', 'end': 'end_ns'}),
+        (change, encoding.alarm_message(change, 'u'),
+         {'header': 'time_ns', 'raised': 'raised_ns', 'previous_state': 'previous'}),
     ):  # fmt: skip
-        assert getattr(message, name) == getattr(change, name), name
+        assert message.header.frame_id == 'u'
+        for name in message.get_fields_and_field_types():
+            found, expected = getattr(message, name), getattr(record, others.get(name, name))
+            found = getattr(found, 'stamp', found)
+            assert (from_time(found) if isinstance(found, Time) else found) == expected, name
+
+
+def test_what_the_curve_says_of_its_reference() -> None:
+    curve = example_curve(Settings()).with_id()
+    ends = [(p.u_from, p.u_to) for p in curve.pieces]
+    moved = tuple(
+        PieceShift(*end, -5.0, -5.0, -5.0, 0.1, math.nan, math.nan, 200.0, 1e-6, True, 0.4)
+        for end in ends
+    )
+    shift = Shift('then', 'now', 5, 4, moved, 6, 7, 8, 'It moved.')
+    told = [
+        encoding.curve_message(curve, CurveStatus.FRESH, '', 'u', *more)
+        for more in ((), (curve.model_id,), ('another',), ('then', shift))
+    ]
+    assert [m.reference_model_id for m in told] == ['', curve.model_id, 'another', 'then']
+    nan = pytest.approx([math.nan] * 2, nan_ok=True)
+    assert [list(m.shift_mw) for m in told] == [[], [0.0, 0.0], nan, [-5.0, -5.0]]
+    assert list(told[-1].shift_confidence) == [p.confidence for p in moved]
+    assert told[-1].shift_sentence == 'It moved.'
+    stamps = [getattr(told[-1], f'shift_since{x}') for x in ('', '_low', '_high')]
+    since = [shift.since_ns, shift.since_low_ns, shift.since_high_ns]
+    assert [from_time(stamp) for stamp in stamps] == since
+    none = encoding.curve_message(None, CurveStatus.UNKNOWN, 'why', 'u', 'another')
+    assert (none.reference_model_id, list(none.shift_mw)) == ('another', [])
+
+
+def test_texts_are_told_in_unit_and_zone_but_names_stay() -> None:
+    cause = DiagnosisCause(name='MW', sentence='5 MW', parameter_units=['MW', '%'])
+    message = Diagnosis(sentence='since 2024-01-02 00:30 UTC', causes=[cause])
+    encoding.tell_in(message, 't/h', zone_of('+05:00'))
+    assert message.sentence == 'since 2024-01-02 05:30 UTC+05:00'
+    assert (cause.name, cause.sentence) == ('MW', '5 t/h')
+    assert list(cause.parameter_units) == ['t/h', '%']
 
 
 def test_the_curve_is_drawn_by_arrays_that_fit_each_other() -> None:
@@ -243,13 +268,9 @@ def test_a_field_of_an_unknown_kind_is_refused() -> None:
         encode(Odd())
 
 
-@given(reals)
-def test_float64_bytes(value: float) -> None:
+@given(reals, times)
+def test_the_short_ways_of_two_types_are_those_of_all(value: float, time_ns: int) -> None:
     assert float64_bytes(value) == encode(Float64(data=value))
-
-
-@given(times)
-def test_clock_bytes(time_ns: int) -> None:
     assert clock_bytes(time_ns) == encode(Clock(clock=encoding.to_time(time_ns)))
 
 

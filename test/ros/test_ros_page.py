@@ -9,6 +9,7 @@ import json
 import re
 import signal
 import socket
+import threading
 import urllib.request
 from collections.abc import Iterator
 
@@ -42,11 +43,15 @@ def speaker(context) -> Iterator[Speaker]:
     node.destroy_node()
 
 
+def page_of(port: int, path: str) -> str:
+    with urllib.request.urlopen(f'http://127.0.0.1:{port}{path}', timeout=10) as answer:
+        return str(answer.read().decode())
+
+
 def metrics(port: int) -> str:
     """Return the metrics, empty while there is no page."""
     try:
-        with urllib.request.urlopen(f'http://127.0.0.1:{port}/metrics', timeout=10) as answer:
-            return str(answer.read().decode())
+        return page_of(port, '/metrics')
     except OSError:
         return ''
 
@@ -55,11 +60,6 @@ def newest(port: int) -> float:
     """Return the time of the newest sample, in seconds."""
     found = re.search(r'^valveflow_sample_timestamp_seconds\S* (\S+)$', metrics(port), re.M)
     return float(found[1]) if found else 0.0
-
-
-def layout(port: int) -> str:
-    with urllib.request.urlopen(f'http://127.0.0.1:{port}/_dash-layout', timeout=10) as answer:
-        return str(answer.read().decode())
 
 
 def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, port, tmp_path):
@@ -85,12 +85,12 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     # Two units of one tag are told apart by their monitors.
     assert 'valveflow_power_residual_watts{unit="/other"} 1.5e+06' in text
     assert 'valveflow_health_level{item="input valve_opening",unit="/valveflow_monitor"} 3' in text
-    assert 'It sticks.' in layout(port)
+    assert 'It sticks.' in page_of(port, '/_dash-layout')
 
-    def twice():
-        return told.exists() and told.read_text().count('\n') == 2
-
-    wait_until(twice, 'a notice of each alarm that stands')
+    wait_until(
+        lambda: told.exists() and told.read_text().count('\n') == 2,
+        'a notice of each alarm that stands',
+    )
     first = json.loads(told.read_text().splitlines()[0])
     assert (first['alarm'], first['state'], first['previous_state']) == (
         'residual', 'unacknowledged', None,
@@ -110,7 +110,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     pressed = {'unit': 1, 'ask': 'shelve curve_shift'}
     output = next(
         d['output']
-        for d in json.loads(_get(port, '/_dash-dependencies'))
+        for d in json.loads(page_of(port, '/_dash-dependencies'))
         if '"answer"' in d['output']
     )
     content = {
@@ -124,8 +124,6 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
         f'http://127.0.0.1:{port}/_dash-update-component', json.dumps(content).encode(),
         {'Content-Type': 'application/json'},
     )  # fmt: skip
-    import threading
-
     answers: list[str] = []
 
     def ask():
@@ -135,32 +133,22 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     thread = threading.Thread(target=ask)
     thread.start()
 
-    def answered():
-        executor.spin_once(timeout_sec=0.05)
-        return answers
-
-    wait_until(answered, 'the answer', 30.0)
+    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or answers, 'the answer', 30.0)
     thread.join()
     executor.shutdown()
     assert asked == [('shelve', 'curve_shift')]
     assert 'Acknowledged.' in answers[0]
     other.destroy_node()
 
-    def gone():
-        return 'valveflow_monitor_up{unit="/other"} 0.0' in metrics(port)
-
-    wait_until(gone, 'the end of the other monitor', 60.0)
-    assert 'The monitor has gone; this is what it said last.' in layout(port)
+    gone = 'valveflow_monitor_up{unit="/other"} 0.0'
+    wait_until(lambda: gone in metrics(port), 'the end of the other monitor', 60.0)
+    assert 'The monitor has gone; this is what it said last.' in page_of(port, '/_dash-layout')
     process.send_signal(signal.SIGTERM)
     assert process.wait(20) == 0
     assert 'Traceback' not in processes.output(process)
 
 
-def _get(port: int, path: str) -> str:
-    with urllib.request.urlopen(f'http://127.0.0.1:{port}{path}', timeout=10) as answer:
-        return str(answer.read().decode())
-
-
+@pytest.mark.long
 def test_a_monitor_that_is_killed_and_started_again(processes, port, browser):
     """The real monitor and a real browser: it goes on with what comes."""
     page = processes.start(PAGE, '--port', str(port))
@@ -195,28 +183,3 @@ def test_a_monitor_that_is_killed_and_started_again(processes, port, browser):
     browser.call('Page.navigate', url='about:blank')
     page.send_signal(signal.SIGINT)
     assert page.wait(20) == 0
-
-
-def test_a_port_that_is_taken_ends_it_in_a_sentence(processes):
-    with socket.create_server(('127.0.0.1', 0)) as taken:
-        process = processes.start(PAGE, '--port', str(taken.getsockname()[1]))
-        assert process.wait(60) == 1
-    said = processes.output(process)
-    assert said.startswith('valveflow page: Port ')
-    assert 'choose one with --port.' in said
-    assert said.count('\n') == 1
-
-
-@pytest.mark.parametrize(
-    ('words', 'told'),
-    [
-        (['--webhook', 'nowhere'], '--webhook must be an address'),
-        (['--on-alarm', ''], '--on-alarm names no command'),
-        (['--token-file', '/no/such/file'], '/no/such/file: cannot be read'),
-    ],
-)
-def test_what_cannot_be_used_is_told(processes, words, told):
-    process = processes.start(PAGE, '--port', '1', *words)
-    assert process.wait(60) == 1
-    assert told in processes.output(process)
-    assert processes.output(process).count('\n') == 1

@@ -17,8 +17,7 @@ from ros_helpers import wait_until
 
 from valveflow_ros.errors import ParameterError
 from valveflow_ros.parameters import TABLE, Parameter, Settings, as_yaml
-from valveflow_ros.ros import monitor_main
-from valveflow_ros.ros.declare import changed, declare, descriptor, unknown_overrides
+from valveflow_ros.ros.declare import changed, declare, unknown_overrides
 from valveflow_ros.ros.node.diagnostics import Level
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 
@@ -116,31 +115,27 @@ def test_live_parameters_take_good_values_and_refuse_bad_ones(running: MonitorNo
         assert node.settings is before
 
 
-def test_fixed_parameters_stay_as_they_are_while_it_runs(running: MonitorNode) -> None:
+def test_the_others_stay_while_it_runs_and_may_be_changed_before(running: MonitorNode) -> None:
+    session = running.session
     for row in FIXED:
         for value in [*good_values(row), *bad_values(row)]:
             result = running.set_parameters_atomically([ros(row.name, value)])
             assert result.successful == means_the_default(row, value), (row.name, value)
             assert result.successful or row.name in result.reason
         assert running.get_parameter(row.name).value == row.default
-    assert running.settings == Settings()
-
-
-def test_unconfigured_every_parameter_may_be_changed(node: MonitorNode) -> None:
-    for row in FIXED:
+        running.session = None
         for value in good_values(row):
-            result = node.set_parameters_atomically([ros(row.name, value)])
+            result = running.set_parameters_atomically([ros(row.name, value)])
             try:
                 alone = Settings({row.name: value})
             except ParameterError as error:  # at odds with another
                 assert result.reason == str(error)
             else:
                 assert result.successful
-                assert node.settings == alone
-        assert node.set_parameters_atomically([ros(row.name, row.default)]).successful
-    assert node.set_parameters_atomically([ros('use_sim_time', True)]).successful
-    assert node.set_parameters_atomically([ros('unit_tag', 'HV7')]).successful
-    assert node.settings.text('unit_tag') == 'HV7'
+                assert running.settings == alone
+        assert running.set_parameters_atomically([ros(row.name, row.default)]).successful
+        running.session = session
+    assert running.settings == Settings()
 
 
 def test_values_have_the_type_of_the_table(context: Any) -> None:
@@ -164,17 +159,15 @@ def test_what_was_dumped_can_be_loaded_while_it_runs(running: MonitorNode) -> No
     assert running.set_parameters_atomically(declared).successful
 
 
-def test_setting_one_after_the_other_is_judged_too(node: MonitorNode) -> None:
-    good, bad = node.set_parameters([ros('alarm_limit', 5), ros('alarm_dead_band', 0.95)])
-    assert good.successful
-    assert not bad.successful
-    assert (node.settings['alarm_limit'], node.settings['alarm_dead_band']) == (5.0, 0.3)
-
-
-def test_all_or_nothing(node: MonitorNode) -> None:
-    both = [ros('alarm_limit', 5.0), ros('alarm_off_delay', -1.0)]
+def test_setting_one_after_the_other_is_judged_too_and_together_it_is_all_or_nothing(
+    node: MonitorNode,
+) -> None:
+    both = [ros('alarm_limit', 5), ros('alarm_dead_band', 0.95)]
     assert not node.set_parameters_atomically(both).successful
     assert node.settings == Settings()
+    good, bad = node.set_parameters(both)
+    assert (good.successful, bad.successful) == (True, False)
+    assert (node.settings['alarm_limit'], node.settings['alarm_dead_band']) == (5.0, 0.3)
 
 
 def test_bad_values_at_the_start_are_refused_with_the_tables_sentence(context: Any) -> None:
@@ -189,18 +182,7 @@ def test_bad_values_at_the_start_are_refused_with_the_tables_sentence(context: A
     overrides = [ros('max_pieces', 'many')]
     with pytest.raises(ParameterError, match='must be a whole number'):
         MonitorNode(context=context, parameter_overrides=overrides)
-
-
-def test_whole_numbers_are_taken_for_real_ones_at_the_start(context: Any) -> None:
-    overrides = [ros('refit_period', 30), ros('max_pieces', 6.0)]
-    node = MonitorNode(context=context, parameter_overrides=overrides)
-    assert node.settings.real('refit_period') == 30.0
-    assert node.settings.whole('max_pieces') == 6
-    node.destroy_node()
-
-
-def test_values_at_odds_are_refused_at_the_start(context: Any) -> None:
-    overrides = [ros('valve_opening_low', 49.0), ros('steady_limit', 9.0)]
+    overrides = [ros('valve_opening_low', 49.0), ros('steady_limit', 9.0)]  # at odds
     with pytest.raises(ParameterError):
         MonitorNode(context=context, parameter_overrides=overrides)
 
@@ -216,66 +198,61 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
     node.destroy_node()
 
 
-def test_changes_leave_foreign_parameters_to_ros() -> None:
+def test_the_clock_cannot_be_taken_over_while_it_runs(running: MonitorNode) -> None:
     foreign = [ros('start_type_description_service', True)]
     assert changed(Settings(), foreign, running=True) == Settings()
-
-
-def test_the_clock_cannot_be_taken_over_while_it_runs(running: MonitorNode) -> None:
-    node = running
-    result = node.set_parameters_atomically([ros('use_sim_time', True)])
-    assert not result.successful
-    assert result.reason == (
+    result = running.set_parameters_atomically([ros('use_sim_time', True)])
+    assert (result.successful, result.reason) == (
+        False,
         "Parameter 'use_sim_time' cannot be changed while the monitor runs; set it at the start, "
-        'or after a clean-up.'
+        'or after a clean-up.',
     )
-    assert node.get_parameter('use_sim_time').value is False
+    assert running.get_parameter('use_sim_time').value is False
 
 
-def test_the_description_holds_no_default_beyond_its_range() -> None:
-    for row in TABLE:
-        found = descriptor(row)
-        for span in [*found.integer_range, *found.floating_point_range]:
-            assert span.from_value <= row.default <= span.to_value
-
-
-def test_from_afar_bad_values_come_back_with_the_sentence(
-    context: Any, running: MonitorNode
-) -> None:
-    node = running
+@pytest.fixture
+def ask(context: Any, running: MonitorNode) -> Any:
+    """Ask a service of the running node from another one."""
     asking = Node('asking', context=context)
     executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    executor.add_node(running)
     executor.add_node(asking)
-    client = asking.create_client(SetParameters, '/valveflow_monitor/set_parameters')
-    wait_until(client.service_is_ready, 'the service', 20.0)
+    clients: dict[str, Any] = {}
+
+    def answer(kind: Any, name: str, request: Any) -> Any:
+        if name not in clients:
+            clients[name] = asking.create_client(kind, f'/valveflow_monitor/{name}')
+            wait_until(clients[name].service_is_ready, 'the service', 20.0)
+        future = clients[name].call_async(request)
+        wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), name, 60.0)
+        return future.result()
+
+    yield answer
+    executor.shutdown()
+    asking.destroy_node()
+
+
+def test_from_afar_bad_values_come_back_with_the_sentence(ask: Any, running: MonitorNode) -> None:
     wanted = [
         ros('alarm_off_delay', math.nan), ros('alarm_off_delay', 'high'), ros('unit_tag', 'x'),
         ros('alarm_off_delay', None), ros('no_such_thing', 1), ros('alarm_off_delay', 6),
     ]  # fmt: skip
     request = SetParameters.Request(parameters=[p.to_parameter_msg() for p in wanted])
-    future = client.call_async(request)
-    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
-    results = future.result().results
+    results = ask(SetParameters, 'set_parameters', request).results
     assert [result.successful for result in results] == [False] * 5 + [True]
     assert results[0].reason == "Parameter 'alarm_off_delay' must be from 0 to 864000 s, not nan."
     assert results[1].reason == "Parameter 'alarm_off_delay' must be a number, not 'high'."
     assert 'cannot be changed while the monitor runs' in results[2].reason
     assert 'alarm_off_delay' in results[3].reason
     assert 'no_such_thing' in results[4].reason
-    assert node.settings.real('alarm_off_delay') == 6.0
-    describe = asking.create_client(DescribeParameters, '/valveflow_monitor/describe_parameters')
-    wait_until(describe.service_is_ready, 'the service', 20.0)
-    future = describe.call_async(DescribeParameters.Request(names=['alarm_off_delay']))
-    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), 'the answer', 20.0)
-    assert future.result().descriptors[0].floating_point_range[0].to_value == 864000.0
-    executor.shutdown()
-    asking.destroy_node()
+    assert running.settings.real('alarm_off_delay') == 6.0
+    names = DescribeParameters.Request(names=['alarm_off_delay'])
+    (found,) = ask(DescribeParameters, 'describe_parameters', names).descriptors
+    assert found.floating_point_range[0].to_value == 864000.0
 
 
-HUGE = [1e308, -1e308, 2**63 - 1, -(2**63), 5e-324]
-HOSTILE = [math.nan, math.inf, -math.inf, -1.0, -1, *HUGE, True, '', 'nan', 'a\nb', 'x' * 100_000,
-           [math.nan], [1], ['a'], [True], [b'\x00'], None]  # fmt: skip
+HOSTILE = [math.nan, -math.inf, -1, 1e308, -(2**63), True, '', 'nan', 'a\nb', 'x' * 100_000,
+           [math.nan], ['a'], [b'\x00'], None]  # fmt: skip
 STRANGE_NAMES = [
     'no_such_thing', '', ' ', 'Record', 'record_directory.', '../record', 'record\n', 'ä' * 2000,
     'qos_overrides./valve_opening.subscription.depth',
@@ -300,70 +277,25 @@ def hostile_wishes() -> list[RosParameter]:
     return wishes
 
 
-@pytest.mark.parametrize('kind', [SetParameters, SetParametersAtomically])
-def test_from_afar_nothing_hostile_gets_in(context: Any, running: MonitorNode, kind: Any) -> None:
-    node = running
-    asking = Node('asking', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    executor.add_node(asking)
-    atomically = kind is SetParametersAtomically
-    service = '/valveflow_monitor/set_parameters' + ('_atomically' if atomically else '')
-    client = asking.create_client(kind, service)
-    wait_until(client.service_is_ready, 'the service', 20.0)
-    declared = {name: node.get_parameter(name).value for name in node._parameters}
+def test_from_afar_nothing_hostile_gets_in(ask: Any, running: MonitorNode) -> None:
+    declared = {name: running.get_parameter(name).value for name in running._parameters}
     wishes = hostile_wishes()
-    if atomically:
-        # One bad value among good ones spoils them all; enough to ask it once for each name.
-        wishes = list({wish.name: wish for wish in wishes}.values())
-    good = ros('alarm_off_delay', 7.0)
-    groups = [[good, wish] for wish in wishes] if atomically else [wishes]
-    for group in groups:
-        request = kind.Request(parameters=[wish.to_parameter_msg() for wish in group])
-        future = client.call_async(request)
-        wait_until(
-            lambda: executor.spin_once(timeout_sec=0.05) or future.done(),  # noqa: B023
-            'the answer', 60.0,
-        )  # fmt: skip
-        answer = future.result()
-        results = [answer.result] if atomically else answer.results
-        assert len(results) == (1 if atomically else len(group))
-        for wish, result in zip(group[-len(results) :], results, strict=True):
-            assert not result.successful, (wish.name, wish.value)
-            assert len(result.reason) > 10, (wish.name, wish.value)
-            if wish.name in declared:
-                assert wish.name in result.reason
-    assert len(wishes) >= (len(TABLE) if atomically else 20 * len(TABLE))
-    assert {name: node.get_parameter(name).value for name in node._parameters} == declared
-    assert node.settings == Settings()
-    executor.shutdown()
-    asking.destroy_node()
-
-
-@pytest.mark.usefixtures('here')
-@pytest.mark.parametrize(
-    ('content', 'words'),
-    [
-        ('/**:\n  ros__parameters:\n    refit_period: -5.0\n', "Parameter 'refit_period' must be"),
-        ('/**:\n  ros__parameters:\n    refit_period: soon\n', "Parameter 'refit_period' must be"),
-        ('/**:\n  ros__parameters:\n    refit_period: .nan\n', "Parameter 'refit_period' must be"),
-        (
-            '/**:\n  ros__parameters:\n    unit_tag: 7\n',
-            "Parameter 'unit_tag' must be a text, not 7; write unit_tag: '7' in a file, "
-            '-p unit_tag:="\'7\'" on a command line.',
-        ),
-        ('/**:\n  ros__parameters: [\n', 'ROS could not be started'),
-    ],
-)
-def test_a_bad_parameter_file_is_one_sentence_and_status_1(
-    capfd: pytest.CaptureFixture[str], tmp_path: Path, content: str, words: str
-) -> None:
-    path = tmp_path / 'bad.yaml'
-    path.write_text(content)
-    assert monitor_main.main(['--ros-args', '--params-file', str(path)]) == 1
-    said = capfd.readouterr().err
-    assert words in said
-    assert said.count('valveflow monitor:') == 1
+    assert len(wishes) >= 15 * len(TABLE)
+    request = SetParameters.Request(parameters=[wish.to_parameter_msg() for wish in wishes])
+    answers = list(zip(wishes, ask(SetParameters, 'set_parameters', request).results, strict=True))
+    # One bad value among good ones spoils them all; enough to ask it once for each name.
+    for wish in {wish.name: wish for wish in wishes}.values():
+        both = [ros('alarm_off_delay', 7.0).to_parameter_msg(), wish.to_parameter_msg()]
+        request = SetParametersAtomically.Request(parameters=both)
+        result = ask(SetParametersAtomically, 'set_parameters_atomically', request).result
+        answers.append((wish, result))
+    for wish, result in answers:
+        assert not result.successful, (wish.name, wish.value)
+        assert len(result.reason) > 10, (wish.name, wish.value)
+        if wish.name in declared:
+            assert wish.name in result.reason
+    assert {name: running.get_parameter(name).value for name in running._parameters} == declared
+    assert running.settings == Settings()
 
 
 def test_a_text_of_digits_is_given_as_the_refusal_of_a_number_says(context: Any) -> None:
@@ -373,7 +305,7 @@ def test_a_text_of_digits_is_given_as_the_refusal_of_a_number_says(context: Any)
     node.destroy_node()
 
 
-def test_the_parameter_file_is_the_table() -> None:
+def test_the_parameter_file_is_the_table_and_ros_reads_it_as_the_defaults(context: Any) -> None:
     # After a change of the table:
     #   python -c "from valveflow_ros.parameters import as_yaml; print(as_yaml(), end='')"
     # goes to config/monitor.yaml.
@@ -381,9 +313,6 @@ def test_the_parameter_file_is_the_table() -> None:
     assert text == as_yaml()
     content = yaml.safe_load(text)
     assert Settings(content['/**']['ros__parameters']) == Settings()
-
-
-def test_ros_reads_the_parameter_file_as_the_defaults(context: Any) -> None:
     path = ROOT / 'config' / 'monitor.yaml'
     node = MonitorNode(context=context, cli_args=['--ros-args', '--params-file', str(path)])
     assert node.settings == Settings()

@@ -6,145 +6,67 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import socket
 import stat
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-from own_sockets import bound, family, readable
 from rclpy.context import Context
 from rclpy.parameter import Parameter as RosParameter
-from ros_helpers import PATIENCE_S, Processes, wait_until
+from ros_helpers import LOOPBACK, PATIENCE_S, rtps_ports
 
-from valveflow_ros.errors import ParameterError, RecordingError, ValveflowError
-from valveflow_ros.logs import Recorder, RecorderSettings, open_log
+from valveflow_ros.errors import ParameterError, RecordingError
+from valveflow_ros.logs import Recorder, RecorderSettings
 from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import domain, monitor_main, replay_main, simulator_main
 from valveflow_ros.ros.domain import InsecureError, check_security
 from valveflow_ros.ros.node.monitor_node import MonitorNode
 from valveflow_ros.ros.node.parameter_files import given_model, given_reference
 from valveflow_ros.ros.node.recording import Recording, new_folder
-from valveflow_ros.ros.node.state_store import LOCK
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
 PROFILE = ROOT / 'config' / 'fastdds_loopback.xml'
-LOOPBACK = '127.0.0.1'
+PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 AT_NS = 1_700_000_000 * 10**9
 
 
-def profile_environment(discovery_range: str = 'SYSTEM_DEFAULT') -> dict[str, str]:
-    return {
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE),
-        'FASTDDS_DEFAULT_PROFILES_FILE': str(PROFILE),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': discovery_range,
-    }
+# Makes a node and prints its sockets.
+NODE = """
+import json, sys
+import psutil, rclpy
+from ros_helpers import bound
+rclpy.init()
+node = rclpy.create_node('sockets')
+json.dump(bound(psutil.Process()), sys.stdout)
+rclpy.shutdown()
+"""
 
 
-def rtps_ports(domain: int) -> range:
-    """Return the ports that DDS gives to a domain (OMG DDSI-RTPS 9.6.1)."""
-    return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
-
-
-# Network
-
-
-def test_addresses_are_read_as_the_kernel_means_them() -> None:
-    assert sys.byteorder == 'big' or readable('0100007F') == LOOPBACK
-    assert readable('00000000') == '0.0.0.0'
-    for kind, name, address in (
-        (socket.AF_INET, 'udp', LOOPBACK),
-        (socket.AF_INET, 'udp', '0.0.0.0'),
-        (socket.AF_INET6, 'udp6', '::1'),
-    ):
-        try:
-            opened = socket.socket(kind, socket.SOCK_DGRAM)
-            opened.bind((address, 0))
-        except OSError:  # no IPv6 here
-            continue
-        with opened:
-            assert (name, address, opened.getsockname()[1]) in bound('self')
-
-
-def sockets_of_a_node(environment: dict[str, str]) -> list[tuple[str, str, int]]:
-    done = subprocess.run(
-        [sys.executable, str(HERE / 'own_sockets.py')],
-        env=environment, capture_output=True, text=True, check=True, timeout=PATIENCE_S,
-    )  # fmt: skip
-    return [(protocol, address, port) for protocol, address, port in json.loads(done.stdout)]
-
-
-def test_without_the_profile_a_node_listens_to_everybody(ros_environment: dict[str, str]) -> None:
-    ports = rtps_ports(int(ros_environment['ROS_DOMAIN_ID']))
-    found = sockets_of_a_node(ros_environment)
-    assert any(address == '0.0.0.0' and port in ports for _, address, port in found)
-
-
-@pytest.mark.parametrize('discovery_range', ['SYSTEM_DEFAULT', 'LOCALHOST', 'SUBNET'])
-def test_with_the_profile_a_node_listens_to_this_host(
+@pytest.mark.parametrize('discovery_range', ['', 'SYSTEM_DEFAULT', 'LOCALHOST'])
+def test_with_the_profile_a_node_listens_to_this_host_alone(
     ros_environment: dict[str, str], discovery_range: str
 ) -> None:
-    ports = rtps_ports(int(ros_environment['ROS_DOMAIN_ID']))
-    found = sockets_of_a_node({**ros_environment, **profile_environment(discovery_range)})
-    listening = [(address, port) for _, address, port in found if port in ports]
-    assert len(listening) >= 2
-    assert {address for address, _ in listening} == {LOOPBACK}
-    if discovery_range != 'LOCALHOST':
-        # LOCALHOST adds transports of its own: two sockets that only send, and shared memory.
-        assert {address for _, address, _ in found} == {LOOPBACK}
-
-
-def test_the_running_monitor_is_on_the_loopback_alone_and_its_files_are_its_owners(
-    processes: Processes, ros_environment: dict[str, str], tmp_path: Path
-) -> None:
-    home, logs = tmp_path / 'home', tmp_path / 'home' / 'logs' / 'ros'
-    home.mkdir()
-    records = home / 'deep' / 'below' / 'recordings'
-    more = {**profile_environment(), 'HOME': str(home), 'ROS_LOG_DIR': str(logs)}
-    before = os.umask(0)
-    try:
-        monitor = processes.start(
-            'valveflow_ros.ros.monitor_main', '--ros-args', '-p', f'record_directory:={records}',
-            '-p', 'input_reliability:=reliable', '-p', 'record_rotation:=1.0', **more,
-        )  # fmt: skip
-    finally:
-        os.umask(before)
-    # A publisher with the same profile reaches it, and hears its predictions.
-    plant = processes.start(
-        'valveflow_ros.ros.simulator_main', '--ros-args', '-p', 'days:=0.02', '-p', 'rate:=0.0',
-        '-p', 'stamped:=true', '-p', f'wait:={PATIENCE_S}', **profile_environment(),
+    environment = {**ros_environment, 'PYTHONPATH': f'{os.environ["PYTHONPATH"]}:{HERE}'}
+    if discovery_range:
+        environment |= dict.fromkeys(PROFILES, str(PROFILE))
+        environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = discovery_range
+    done = subprocess.run(
+        [sys.executable, '-c', NODE],
+        env=environment, capture_output=True, text=True, check=True, timeout=PATIENCE_S,
     )  # fmt: skip
-    wait_until(lambda: plant.poll() is not None or monitor.poll() is not None, 'the plant')
-    assert plant.returncode == 0, processes.output(plant) + processes.output(monitor)
-    assert 'Nobody listens' not in processes.output(plant)
-
+    found = json.loads(done.stdout)
     ports = rtps_ports(int(ros_environment['ROS_DOMAIN_ID']))
-    found = [socket for pid in family(monitor.pid) for socket in bound(pid)]
-    assert len([port for _, _, port in found if port in ports]) >= 2
-    assert {address for _, address, _ in found} == {LOOPBACK}
-
-    monitor.send_signal(signal.SIGTERM)
-    assert monitor.wait(20.0) == 0, processes.output(monitor)
-    (folder,) = records.glob('valveflow_*')
-    log = open_log(folder)
-    assert log.topics['/plant_sample'].count == round(0.02 * 86400)
-
-    everything = [path for path in home.rglob('*') if '.numba' not in str(path)]
-    files = [path for path in everything if path.is_file()]
-    assert {'metadata.yaml', LOCK} <= {path.name for path in files}
-    assert any(path.suffix == '.log' for path in files)
-    assert len([path for path in files if path.suffix == '.mcap']) >= 1
-    modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in everything}
-    assert {mode for path, mode in modes.items() if Path(path).is_file()} == {0o600}, modes
-    assert {mode for path, mode in modes.items() if Path(path).is_dir()} == {0o700}, modes
+    listening = {address for address, port in found if port in ports}
+    assert listening == {LOOPBACK} if discovery_range else '0.0.0.0' in listening
+    if discovery_range == 'SYSTEM_DEFAULT':
+        # LOCALHOST adds transports of its own: two sockets that only send, and shared memory.
+        assert {address for address, _ in found} == {LOOPBACK}
 
 
 def test_the_profile_is_installed_and_closed() -> None:
@@ -158,37 +80,25 @@ def test_the_profile_is_installed_and_closed() -> None:
 # Demanded security
 
 KEYS = 'KEYS'
+ENABLE, STRATEGY, KEYSTORE = (f'ROS_SECURITY_{x}' for x in ('ENABLE', 'STRATEGY', 'KEYSTORE'))
+ENFORCED = {ENABLE: 'true', STRATEGY: 'Enforce'}
+WITH_KEYS = {**ENFORCED, KEYSTORE: KEYS}
 DEMANDS = [
-    ({'ROS_SECURITY_ENABLE': 'true'}, 'ROS_SECURITY_STRATEGY is not set'),
-    (
-        {'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Permissive'},
-        "ROS_SECURITY_STRATEGY is 'Permissive'",
-    ),
-    (
-        {'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'enforce'},
-        "ROS_SECURITY_STRATEGY is 'enforce'",
-    ),
-    ({'ROS_SECURITY_ENABLE': 'True', 'ROS_SECURITY_STRATEGY': 'Enforce'}, "not 'True'"),
-    ({'ROS_SECURITY_ENABLE': '1', 'ROS_SECURITY_STRATEGY': 'Enforce'}, "not '1'"),
-    (
-        {'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce'},
-        'ROS_SECURITY_KEYSTORE',
-    ),
-    (
-        {
-            'ROS_SECURITY_ENABLE': 'true',
-            'ROS_SECURITY_STRATEGY': 'Enforce',
-            'ROS_SECURITY_KEYSTORE': KEYS,
-        },
-        # What a middleware that has it says of an empty keystore is its own.
-        '',
-    ),
+    ({ENABLE: 'true'}, 'ROS_SECURITY_STRATEGY is not set'),
+    ({ENABLE: 'true', STRATEGY: 'Permissive'}, "ROS_SECURITY_STRATEGY is 'Permissive'"),
+    ({ENABLE: 'True', STRATEGY: 'Enforce'}, "not 'True'"),
+    ({ENABLE: '1', STRATEGY: 'Enforce'}, "not '1'"),
+    (ENFORCED, 'ROS_SECURITY_KEYSTORE'),
+    # What a middleware that has it says of an empty keystore is its own.
+    (WITH_KEYS, ''),
 ]
 MAINS: list[tuple[str, Callable[[list[str]], int], list[str]]] = [
     ('monitor', monitor_main.main, []),
     ('plant_simulator', simulator_main.main, []),
     ('replay', replay_main.main, ['nothing.csv', '--wait', '0']),
 ]
+# Each demand of the monitor, and the last one of everybody.
+REFUSED = [(MAINS[0], demand) for demand in DEMANDS] + [(main, DEMANDS[-1]) for main in MAINS[1:]]
 
 
 @pytest.fixture
@@ -208,19 +118,13 @@ def demanded(
 
 
 @pytest.mark.usefixtures('here')
-@pytest.mark.parametrize(('environment', 'words'), DEMANDS)
-@pytest.mark.parametrize(('name', 'main', 'arguments'), MAINS, ids=[main[0] for main in MAINS])
+@pytest.mark.parametrize(('main', 'demand'), REFUSED)
 def test_no_start_where_security_is_demanded_and_cannot_be_had(
-    demanded: Any,
-    capfd: pytest.CaptureFixture[str],
-    name: str,
-    main: Callable[[list[str]], int],
-    arguments: list[str],
-    environment: dict[str, str],
-    words: str,
+    demanded: Any, capfd: pytest.CaptureFixture[str], main: Any, demand: Any
 ) -> None:
+    (name, run, arguments), (environment, words) = main, demand
     demanded(environment)
-    assert main(arguments) == 1
+    assert run(arguments) == 1
     said = capfd.readouterr().err
     start = f'valveflow {name}: Not started, because security is demanded (ROS_SECURITY_ENABLE): '
     (line,) = [line for line in said.splitlines() if line.startswith('valveflow')]
@@ -231,7 +135,7 @@ def test_no_start_where_security_is_demanded_and_cannot_be_had(
 
 
 def test_a_middleware_without_security_is_called_by_its_name(demanded: Any) -> None:
-    demanded(DEMANDS[-1][0])
+    demanded(WITH_KEYS)
     with pytest.raises(InsecureError) as refusal:
         check_security([])
     library = b''.join(
@@ -256,11 +160,11 @@ def contexts(monkeypatch: pytest.MonkeyPatch) -> list[Context]:
     return made
 
 
-@pytest.mark.parametrize('value', ['', 'false', 'False', '0', 'no', 'off'])
+@pytest.mark.parametrize('value', ['', 'False', '0', 'no', 'off'])
 def test_who_demands_nothing_is_let_through(
     demanded: Any, contexts: list[Context], value: str
 ) -> None:
-    demanded({'ROS_SECURITY_ENABLE': value, 'ROS_SECURITY_STRATEGY': 'Permissive'})
+    demanded({ENABLE: value, STRATEGY: 'Permissive'})
     check_security([])
     check_security([], {})
     assert not contexts, 'no node has to be tried'
@@ -270,9 +174,7 @@ def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
     demanded: Any, contexts: list[Context], tmp_path: Path
 ) -> None:
     demanded({})
-    wish = {
-        name: value.replace(KEYS, str(tmp_path / 'keys')) for name, value in DEMANDS[-1][0].items()
-    }
+    wish = {**ENFORCED, KEYSTORE: str(tmp_path / 'keys')}
     # The stack itself sees no wish, so that its node stands for one that got what it wished for.
     check_security(['--ros-args', '--enclave', '/a'], wish)
     check_security(None, wish)
@@ -282,7 +184,7 @@ def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
 def test_an_unknown_middleware_is_not_trusted_to_refuse(
     demanded: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    demanded(DEMANDS[-1][0])
+    demanded(WITH_KEYS)
     monkeypatch.setattr(domain, 'get_rmw_implementation_identifier', lambda: 'rmw_new_cpp')
     with pytest.raises(InsecureError, match='of rmw_new_cpp it is not known'):
         check_security([])
@@ -322,31 +224,17 @@ def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(
 
 def within(limit_s: float, work: Callable[[], object]) -> None:
     """Do work that must not wait for anybody; raises what it raises."""
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            work()
-        except BaseException as error:  # noqa: BLE001
-            errors.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    thread.join(limit_s)
-    assert not thread.is_alive(), 'it waits'
-    if errors:
-        raise errors[0]
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(work).result(limit_s)
 
 
-PATHS = [row.name for row in TABLE if row.name.endswith(('_directory', '_file', '_tag'))]
-
-
-@pytest.mark.parametrize('name', PATHS)
 @pytest.mark.parametrize('text', ['a\0b', 'a\nb', 'a\x1b[2Jb', 'x' * 501, 'a\u202eb'])
-def test_a_path_is_one_printable_line(context: Any, name: str, text: str) -> None:
-    with pytest.raises(ParameterError, match='must be one line of at most 500 printable'):
-        Settings({name: text})
-    overrides = [RosParameter(name, value=text)]
+def test_a_path_is_one_printable_line(context: Any, text: str) -> None:
+    names = [row.name for row in TABLE if row.name.endswith(('_directory', '_file', '_tag'))]
+    for name in names:
+        with pytest.raises(ParameterError, match='must be one line of at most 500 printable'):
+            Settings({name: text})
+    overrides = [RosParameter(names[0], value=text)]
     with pytest.raises(ParameterError) as error:
         MonitorNode(context=context, parameter_overrides=overrides)
     assert str(error.value).isprintable()
@@ -398,35 +286,8 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
     (elsewhere / 'victim').write_text('untouched')
     for name in (f'{made.name}_0.mcap.part', f'{made.name}_0.mcap', 'metadata.yaml'):
         (made / name).symlink_to(elsewhere / 'victim')
-    limits = RecorderSettings(flush_period_s=0.01, free_floor_bytes=0, retry_s=0.01)
-    recorder = Recorder(made, limits)
+    recorder = Recorder(made, RecorderSettings(free_floor_bytes=0, retry_s=0.01))
     recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
     recorder.record('/a', bytes(12), AT_NS, AT_NS)
     recorder.close(10.0)
-    assert (elsewhere / 'victim').read_text() == 'untouched'
-    assert [path.name for path in elsewhere.iterdir()] == ['victim']
-
-
-@pytest.mark.parametrize('umask', [0o000, 0o022, 0o077])
-def test_what_is_recorded_is_its_owners_whatever_the_umask(tmp_path: Path, umask: int) -> None:
-    before = os.umask(umask)
-    try:
-        limits = RecorderSettings(flush_period_s=0.01, rotate_s=0.05, free_floor_bytes=0)
-        recorder = Recorder(tmp_path / 'a' / 'b', limits)
-        recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
-        recorder.record('/a', bytes(12), AT_NS, AT_NS)
-        wait_until(lambda: recorder.status().files_finished, 'a finished split', 20.0)
-        recorder.close(20.0)
-    finally:
-        os.umask(before)
-    found = list((tmp_path / 'a').rglob('*'))
-    files = {path.name: stat.S_IMODE(path.stat().st_mode) for path in found if path.is_file()}
-    assert yaml.safe_load((tmp_path / 'a' / 'b' / 'metadata.yaml').read_text())
-    assert set(files.values()) == {0o600}
-    for folder in (tmp_path / 'a', tmp_path / 'a' / 'b'):
-        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-
-
-def test_a_refusal_is_one_of_ours() -> None:
-    assert issubclass(InsecureError, ValveflowError)
-    assert str(InsecureError('why')).endswith('(ROS_SECURITY_ENABLE): why.')
+    assert [path.read_text() for path in elsewhere.iterdir()] == ['untouched']

@@ -97,9 +97,15 @@ def watch(context, monkeypatch) -> Iterator[WatchNode]:
     node.destroy_node()
 
 
-def test_what_the_monitor_says_is_shown(context, speaker, watch):
+@pytest.fixture
+def executor(context) -> Iterator[SingleThreadedExecutor]:
+    made = SingleThreadedExecutor(context=context)
+    yield made
+    made.shutdown()
+
+
+def test_what_the_monitor_says_is_shown(speaker, watch, executor):
     assert watch.frame().note.startswith('Waiting for a monitor.')
-    executor = SingleThreadedExecutor(context=context)
     executor.add_node(watch)
 
     def complete():
@@ -124,7 +130,6 @@ def test_what_the_monitor_says_is_shown(context, speaker, watch):
     assert frame.recorder.sentence == 'Recording.'
     text = '\n'.join(screen(frame, 80, 24))
     assert 'opening: silent for 9 s.' in text
-    executor.shutdown()
 
 
 def test_with_two_monitors_one_has_to_choose(context, speaker, watch):
@@ -141,12 +146,7 @@ def test_with_two_monitors_one_has_to_choose(context, speaker, watch):
 
 def test_one_picture_of_a_real_process(speaker, processes):
     process = processes.start('valveflow_ros.ros.watch_main', '--once', '--json')
-
-    def done():
-        speaker.go_on()
-        return process.poll() is not None
-
-    wait_until(done, 'the picture')
+    wait_until(lambda: speaker.go_on() or process.poll() is not None, 'the picture')
     assert process.returncode == 0, processes.output(process)
     frame = json.loads(processes.output(process))
     assert frame['curve']['breakpoints'] == [1000.0, 2000.0]
@@ -155,40 +155,37 @@ def test_one_picture_of_a_real_process(speaker, processes):
 
 @pytest.mark.parametrize('sends', [True, False])
 def test_one_picture_waits_for_a_sample_or_says_that_none_came(
-    speaker, watch, capsys, monkeypatch, sends
+    speaker, watch, executor, capsys, monkeypatch, sends
 ):
+    monkeypatch.setattr(watch_main, '_HEAR_S', 1.0)
     monkeypatch.setattr(watch_main.time, 'time_ns', lambda: (AT_S + 90) * 10**9)
-    executor = SingleThreadedExecutor(context=speaker.context)
     executor.add_node(watch)
 
-    def found():
-        watch.look()
-        return watch.monitor
-
     def latched():
+        watch.look()
         speaker.say_health()
         executor.spin_once(timeout_sec=0.05)
         return {CURVE, HEALTH} <= watch.heard
 
-    wait_until(found, 'the monitor')
     wait_until(latched, 'what comes before the first sample')
     if sends:
         speaker.create_timer(0.2, speaker.go_on)
         executor.add_node(speaker)
     assert watch_main._once(watch, executor, True, None) == 0
     frame = json.loads(capsys.readouterr().out)
-    executor.shutdown()
     if sends:
         assert (frame['note'], frame['last']['residual_mw']) == ('', 1.5)
     else:
         assert frame['last'] is None
-        assert frame['note'].startswith('No sample was received within 3 s.')
+        assert frame['note'].startswith('No sample was received within 1 s.')
         assert frame['note'].endswith('The newest message shown is 1 min 30 s old.')
 
 
 @pytest.mark.parametrize(('success', 'status'), [(True, 0), (False, 1)])
 @pytest.mark.parametrize('alarm', ['', 'residual'])
-def test_the_monitor_is_asked_and_its_answer_told(speaker, processes, success, status, alarm):
+def test_the_monitor_is_asked_and_its_answer_told(
+    speaker, watch, executor, capsys, success, status, alarm
+):
     asked = []
 
     def answer(request, response):
@@ -198,33 +195,27 @@ def test_the_monitor_is_asked_and_its_answer_told(speaker, processes, success, s
 
     kind, name = (OperateAlarm, 'operate_alarm') if alarm else (Trigger, 'acknowledge_alarms')
     speaker.create_service(kind, f'~/{name}', answer)
-    words = ['--ask', 'acknowledge_alarms', *(['--alarm', alarm] if alarm else [])]
-    process = processes.start('valveflow_ros.ros.watch_main', *words)
-    executor = SingleThreadedExecutor(context=speaker.context)
     executor.add_node(speaker)
-
-    def done():
-        executor.spin_once(timeout_sec=0.05)
-        return process.poll() is not None
-
-    wait_until(done, 'the answer')
-    executor.shutdown()
+    executor.add_node(watch)
+    assert watch_main._ask(watch, executor, 'acknowledge_alarms', alarm) == status
     (request,) = asked
     assert not alarm or (request.name, request.action) == ('residual', 'acknowledge')
-    assert process.returncode == status
-    assert 'There is an answer.' in processes.output(process)
+    told = capsys.readouterr()
+    assert 'There is an answer.' in (told.out if success else told.err)
 
 
-def test_a_monitor_that_does_not_answer_is_told(speaker, processes):
-    process = processes.start('valveflow_ros.ros.watch_main', '--ask', 'refit')
-
-    def done():
-        speaker.go_on()
-        return process.poll() is not None
-
-    wait_until(done, 'the end')
-    assert process.returncode == 1
-    assert '/valveflow_monitor does not answer' in processes.output(process)
+@pytest.mark.parametrize('there', [True, False])
+def test_a_monitor_that_does_not_answer_is_told(
+    context, watch, executor, capsys, monkeypatch, there
+):
+    monkeypatch.setattr(watch_main, '_FIND_S', 1.0)
+    speaker = Speaker(context) if there else None
+    executor.add_node(watch)
+    assert watch_main._ask(watch, executor, 'refit', '') == 1
+    told = '/valveflow_monitor does not answer' if there else 'Waiting for a monitor.'
+    assert told in capsys.readouterr().err
+    if speaker is not None:
+        speaker.destroy_node()
 
 
 def test_messages_within_messages_become_mappings():
@@ -233,11 +224,3 @@ def test_messages_within_messages_become_mappings():
     assert found['causes'][0]['name'] == 'a'
     assert found['causes'][0]['parameter_names'] == ['x']
     assert found['header']['stamp'] == {'sec': 0, 'nanosec': 0}
-
-
-def test_help_needs_no_ros_to_run(capsys):
-    with pytest.raises(SystemExit) as ended:
-        watch_main.main(['--help'])
-    assert ended.value.code == 0
-    page = capsys.readouterr().out
-    assert 'examples:\n  ros2 run valveflow_ros watch' in page

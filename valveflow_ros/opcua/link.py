@@ -78,15 +78,9 @@ class LinkState:
 class Link:
     """Maintains the subscription of a unit while `run` is active.
 
-    Parameters
-    ----------
-    unit : UnitMapping
-    tell : callable
-        Called with functions to apply, in order, to the unit's `Sampler`, which may belong to
-        another thread.
-    save : callable, optional
-        Called in a separate thread with the readings of an outage, in parts in time order;
-        returns a clause about the result.
+    ``tell`` is called with functions to apply, in order, to the unit's `Sampler`, which may belong
+    to another thread. ``save`` is called in a separate thread with the readings of an outage, in
+    parts in time order, and returns a clause about the result.
     """
 
     def __init__(

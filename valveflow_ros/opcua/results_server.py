@@ -88,12 +88,8 @@ class _Readers:
 class ResultsServer:
     """The server; all calls must be made in one event loop.
 
-    Parameters
-    ----------
-    settings : ServerSettings
-    units : mapping of str to mapping of str to sequence of Field
-        Objects by unit tag, such as ``characteristic`` and ``alarms.residual``, and their
-        variables. The id of a variable is ``ns=N;s=TAG.OBJECT.FIELD``.
+    ``units`` are objects by unit tag, such as ``characteristic`` and ``alarms.residual``, and
+    their variables. The id of a variable is ``ns=N;s=TAG.OBJECT.FIELD``.
     """
 
     def __init__(
@@ -109,12 +105,8 @@ class ResultsServer:
     async def start(self) -> list[str]:
         """Start the server; return warnings about client certificates that cannot be used.
 
-        Raises
-        ------
-        DataError
-            If the address is in use or does not belong to this machine.
-        RecordingError
-            If the server's own certificate or key cannot be used.
+        Raises `DataError` if the address is in use or does not belong to this machine, and
+        `RecordingError` if the server's own certificate or key cannot be used.
         """
         from asyncua import Server, ua
 
@@ -256,12 +248,7 @@ def _id(index: int, text: str) -> Any:
 async def read_results(endpoint: str, security: Security, names: Sequence[str]) -> list[Any]:
     """Return variables of a results server by name, such as ``U1.characteristic.status``.
 
-    A variable without a value is None.
-
-    Raises
-    ------
-    Exception
-        If the server cannot be reached or refuses; see `in_words`.
+    A variable without a value is None. Raises whatever asyncua raises; see `in_words`.
     """
     async with connected(endpoint, security, User()) as client:
         index = await client.get_namespace_index(NAMESPACE)

@@ -98,11 +98,7 @@ class _Held:
 class Sampler:
     """Stores the values of a unit and returns its samples, period by period.
 
-    Parameters
-    ----------
-    unit : UnitMapping
-    now_ns : int
-        The first period ends after this time.
+    The first period ends after ``now_ns``.
 
     Notes
     -----

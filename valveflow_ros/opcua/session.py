@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import logging
 import math
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Iterable, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from importlib.util import find_spec
@@ -122,13 +122,7 @@ def read_certificate(path: Path) -> Certificate:
 
 
 def load_certificate(path: Path) -> Certificate:
-    """Return a certificate that is valid now.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read, has expired or is not valid yet.
-    """
+    """Return a certificate that is valid now; raises `RecordingError` if there is none."""
     found = read_certificate(path)
     if problem := not_valid(found):
         raise RecordingError(path, problem)
@@ -151,12 +145,8 @@ async def _server_certificate(endpoint: str, trusted: Sequence[Path]) -> Certifi
     With several trusted certificates, the server is asked for its own one. The response is not
     protected, so it only selects one of the trusted certificates.
 
-    Raises
-    ------
-    RecordingError
-        If it is not valid now or cannot be read.
-    DataError
-        If the server has none of them.
+    Raises `RecordingError` if it is not valid now or cannot be read, and `DataError` if the server
+    has none of them.
     """
     from asyncua import Client
     from cryptography.hazmat.primitives.serialization import Encoding
@@ -263,10 +253,7 @@ async def connected(endpoint: str, security: Security, user: User) -> AsyncItera
 async def resolve(client: Client, node: Node) -> ua.NodeId:
     """Return the id of a node; a namespace given by its URI is looked up on the server.
 
-    Raises
-    ------
-    DataError
-        If the server does not know the namespace, or the id has no valid form.
+    Raises `DataError` if the server does not know it, or the id has no valid form.
     """
     from asyncua import ua
 
@@ -289,10 +276,7 @@ async def read_history(
 ) -> list[Change]:
     """Return the history of a node in time order, including both end points.
 
-    Raises
-    ------
-    Exception
-        If the server has no history or cannot be reached; see `in_words`.
+    Raises whatever asyncua raises if there is none or no link; see `in_words`.
     """
     values = await client.get_node(node_id).read_raw_history(
         to_datetime(start_ns), to_datetime(end_ns), return_bounds=False
@@ -313,32 +297,27 @@ async def history(
 ) -> AsyncIterator[Readings]:
     """Yield the history of nodes in parts of an hour; ``end_ns`` itself is excluded.
 
-    Raises
-    ------
-    DataError
-        If a node does not exist, or has no history that can be read.
-    Exception
-        If the server cannot be reached; see `in_words`.
+    Raises `DataError` if a node does not exist, or has no history that can be read, and whatever
+    asyncua raises if the server cannot be reached; see `in_words`.
     """
     ids = [(node, await resolve(client, node)) for node in nodes]
     for node, node_id in ids:  # servers may return an empty history for a missing node
-        try:
-            await client.get_node(node_id).read_node_class()
-        except Exception as error:  # noqa: BLE001 - with the name of the signal
-            raise DataError(
-                f'{SIGNALS[node.signal].topic}, {node.node}: {in_words(error)}.'
-            ) from None
+        await _named(node, client.get_node(node_id).read_node_class())
     for part_ns in range(start_ns, end_ns, HISTORY_PART_NS):
         last_ns = min(part_ns + HISTORY_PART_NS, end_ns) - 1000
         changes: list[Change] = []
         for node, node_id in ids:
-            try:
-                changes += await read_history(client, node, node_id, part_ns, last_ns)
-            except Exception as error:  # noqa: BLE001 - with the name of the signal
-                raise DataError(
-                    f'{SIGNALS[node.signal].topic}, {node.node}: {in_words(error)}.'
-                ) from None
+            changes += await _named(node, read_history(client, node, node_id, part_ns, last_ns))
         yield readings_of(changes)
+
+
+async def _named(node: Node, work: Awaitable[Any]) -> Any:
+    """Return a result; a failure names the signal."""
+    try:
+        return await work
+    except Exception as error:  # noqa: BLE001 - with the name of the signal
+        topic = SIGNALS[node.signal].topic
+        raise DataError(f'{topic}, {node.node}: {in_words(error)}.') from None
 
 
 def _called(node: Node) -> str:
@@ -351,11 +330,7 @@ def _called(node: Node) -> str:
 class OpcUaHistory:
     """The history of a unit's nodes, as a source for `valveflow import`.
 
-    Parameters
-    ----------
-    unit : UnitMapping
-    endpoint : str
-        Replaces the endpoint of the unit.
+    ``endpoint`` replaces that of the unit.
     """
 
     def __init__(self, unit: UnitMapping, endpoint: str) -> None:
@@ -366,10 +341,7 @@ class OpcUaHistory:
     def read(self, start_ns: int, end_ns: int) -> list[Readings]:
         """Return the readings of a period, without its end, in the monitor's units.
 
-        Raises
-        ------
-        DataError
-            If the server has no such node or no history, or cannot be reached.
+        Raises `DataError` if the server has no such node or no history, or cannot be reached.
         """
 
         async def parts() -> list[Readings]:

@@ -73,6 +73,14 @@ def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]
     return values
 
 
+def declare_all(node: Node, table: Iterable[Parameter], *others: str) -> dict[str, object]:
+    """Do the same as `declare`, and warn of given parameters that are neither rows nor others."""
+    values = declare(node, table)
+    for sentence in unknown_overrides(node, [*values, *others]):
+        node.get_logger().warning(f'{sentence} It is ignored.')
+    return values
+
+
 def in_type(wanted: Iterable[RosParameter]) -> list[RosParameter]:
     """Return parameters converted to the types of the table; invalid ones are unchanged."""
     found = []
@@ -123,11 +131,7 @@ _POLICIES = {'history': ('keep_last', 'keep_all'), 'reliability': ('reliable', '
 def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list[str]:
     """Return a sentence for each QoS override that is for none of our topics.
 
-    Parameters
-    ----------
-    node : Node
-    topics : mapping of str to iterable of str
-        Full names by 'publisher' and 'subscription'.
+    ``topics`` are full names by 'publisher' and 'subscription'.
 
     Raises
     ------
@@ -183,12 +187,7 @@ def inputs(node: Node, settings: Settings) -> dict[str, str]:
 def changed(settings: Settings, wanted: Iterable[RosParameter], *, running: bool) -> Settings:
     """Return settings with some parameters changed.
 
-    Parameters
-    ----------
-    settings : Settings
-    wanted : iterable of Parameter
-    running : bool
-        True if only live parameters may change.
+    While ``running``, only live parameters may change.
 
     Raises
     ------

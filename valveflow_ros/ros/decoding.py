@@ -31,21 +31,30 @@ _VALUE = {b'\x00\x01': struct.Struct('<d'), b'\x00\x00': struct.Struct('>d')}
 _HEAD = 4  # bytes of encapsulation before the data, which give the encoding
 
 
+def type_name(kind: type) -> str:
+    """Return the name of a message type, such as std_msgs/msg/Float64."""
+    return f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+
+
 @dataclass(frozen=True, slots=True)
 class InputTopic:
     """A topic to which the monitor subscribes; ``topic`` is its name before remapping."""
 
     name: str
     message_type: type
-    type_name: str
     topic: str
+
+    @property
+    def type_name(self) -> str:
+        """Return the name of the message type, as in a recording."""
+        return type_name(self.message_type)
 
 
 # The optional signal comes first, so that it is known when the required ones are complete.
 _IN_ORDER = tuple(sorted(SIGNALS, key=lambda info: info.required))
 INPUTS: tuple[InputTopic, ...] = (
-    *(InputTopic(info.topic, Float64, 'std_msgs/msg/Float64', info.topic) for info in _IN_ORDER),
-    InputTopic(PLANT_SAMPLE, PlantSample, 'valveflow_msgs/msg/PlantSample', PLANT_SAMPLE),
+    *(InputTopic(info.topic, Float64, info.topic) for info in _IN_ORDER),
+    InputTopic(PLANT_SAMPLE, PlantSample, PLANT_SAMPLE),
 )
 INPUT_BY_NAME = {topic.name: topic for topic in INPUTS}
 INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
@@ -54,13 +63,8 @@ INPUT_ORDER = {topic.name: k for k, topic in enumerate(INPUTS)}
 def inputs_of(settings: Settings) -> tuple[InputTopic, ...]:
     """Return all topics to which the monitor subscribes: those of covariates come first."""
     beside = map(parts, entries_of(settings))
-    return (
-        *(
-            InputTopic(f'covariate {name}', Float64, 'std_msgs/msg/Float64', topic)
-            for name, topic, _ in beside
-        ),
-        *INPUTS,
-    )
+    found = (InputTopic(f'covariate {name}', Float64, topic) for name, topic, _ in beside)
+    return (*found, *INPUTS)
 
 
 def header_time_ns(data: bytes) -> int:
@@ -78,13 +82,7 @@ def from_time(stamp: Time) -> int:
 
 
 def journal_entry(data: bytes) -> JournalEntry:
-    """Return a line of the journal as the engine's record.
-
-    Raises
-    ------
-    ValueError
-        If the bytes are no line of a journal.
-    """
+    """Return a line of the journal as the engine's record; raises `ValueError` if it is none."""
     try:
         message = deserialize_message(data, JournalMessage)
         return JournalEntry(
@@ -103,12 +101,8 @@ def journal_entry(data: bytes) -> JournalEntry:
 class Decoder:
     """Converts the bytes of an input message to readings.
 
-    Parameters
-    ----------
-    settings : Settings
-        Gives the unit in which each plain topic is sent.
-    definition : str
-        The ros2msg text of a recorded PlantSample; empty for the current definition.
+    The settings give the unit in which each plain topic is sent; ``definition`` is the ros2msg
+    text of a recorded PlantSample, empty for the current one.
     """
 
     def __init__(self, settings: Settings, definition: str = '') -> None:
@@ -127,13 +121,7 @@ class Decoder:
         return header_time_ns(data) if name == PLANT_SAMPLE else otherwise_ns
 
     def rows(self, name: str, data: bytes, time_ns: int) -> list[Row]:
-        """Return the readings in a message.
-
-        Raises
-        ------
-        ValueError
-            If the bytes are no message of this topic's type.
-        """
+        """Return the readings in a message; raises `ValueError` if it is not of its type."""
         return self._read[name](data, time_ns)
 
     def recorded(self, name: str, data: bytes, publish_time_ns: int) -> list[Row]:
@@ -187,13 +175,7 @@ def _sample_reader(quality: Sequence[int]) -> Callable[[bytes, int], list[Row]]:
 
 
 def sample_warnings(data: bytes, settings: Settings) -> list[str]:
-    """Return what in a PlantSample does not agree with the parameters.
-
-    Raises
-    ------
-    ValueError
-        The bytes are no PlantSample.
-    """
+    """Return what in a PlantSample does not agree with the parameters; raises `ValueError`."""
     sample, found = _sample(data), []
     for info in SIGNALS:
         name, code = f'{info.topic}_unit', getattr(sample, f'{info.topic}_quality')
@@ -214,13 +196,7 @@ def sample_warnings(data: bytes, settings: Settings) -> list[str]:
 
 
 def with_todays_codes(data: bytes) -> bytes:
-    """Convert a PlantSample with earlier quality codes (0 is good) to the current codes.
-
-    Raises
-    ------
-    ValueError
-        If the bytes are no PlantSample.
-    """
+    """Convert a PlantSample with earlier quality codes (0 is good) to the current codes."""
     sample = _sample(data)
     for info in _IN_ORDER:
         name = f'{info.topic}_quality'

@@ -16,12 +16,10 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
@@ -33,7 +31,8 @@ from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.terminal.text import number, whole
 from valveflow_ros.ros.decoding import from_time
-from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
+from valveflow_ros.ros.domain import run, spinning
+from valveflow_ros.ros.process import Parser, StopFlag
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _HOUR_NS = 3600 * 10**9
@@ -149,11 +148,7 @@ class Story:
     A fault of one valve has an effect only while this valve is in use, so its alarm comes and
     goes with the load, and the monitor fits a new curve every few hours. The first alarm and
     curve are described in full, the others briefly or only if something has changed.
-
-    Parameters
-    ----------
-    fault_ns : int
-        Time at which the hidden fault begins.
+    ``fault_ns`` is the time at which the hidden fault begins.
     """
 
     def __init__(self, fault_ns: int) -> None:
@@ -311,22 +306,19 @@ class Watch(Node):
         self.acknowledged += int(response is not None and response.success)
 
 
-def run(options: argparse.Namespace, stop: StopFlag) -> int:
-    """Run the demo; return the exit status."""
+def _run(options: argparse.Namespace, stop: StopFlag) -> int:
     folder: Path = options.output.resolve()
-    folder.mkdir(parents=True, exist_ok=True)
     fault_ns = DEFAULT_START_NS + round(_FAULT_FROM * options.days * 24 * _HOUR_NS)
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     story = Story(fault_ns)
     watch = Watch(story)
-    executor = SingleThreadedExecutor()
-    executor.add_node(watch)
-    processes: list[Process] = []
-    try:
+    with contextlib.ExitStack() as stack:
+        executor = stack.enter_context(spinning(watch))
         _introduce(options, fault_ns)
         begun_s = time.monotonic()
+        processes = []
         for name, module, parameters in _commands(options, folder):
             processes.append(Process(name, module, parameters, folder))
+            stack.callback(processes[-1].end)
         monitor, plant = processes
         _follow(watch, executor, monitor, plant, stop)
         if stop:
@@ -339,12 +331,6 @@ def run(options: argparse.Namespace, stop: StopFlag) -> int:
         if status != 0:
             raise ValveflowError(f'The monitor ended with status {status}: {monitor.last_line()}')
         return _conclude(watch, story, folder, fault_ns, options.days)
-    finally:
-        for process in processes:
-            process.end()
-        executor.shutdown()
-        watch.destroy_node()
-        rclpy.try_shutdown()
 
 
 def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
@@ -387,7 +373,7 @@ def _commands(
 
 def _follow(
     watch: Watch,
-    executor: SingleThreadedExecutor,
+    executor: Executor,
     monitor: Process,
     plant: Process,
     stop: StopFlag,
@@ -507,14 +493,16 @@ def main(args: Sequence[str] | None = None) -> int:
     os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     stop = StopFlag().install()
-    try:
-        status = run(options, stop)
-    except ValveflowError as error:
-        return complain('demo', str(error))
-    except OSError as error:
-        return complain('demo', f'{error.filename or options.output}: {error.strerror}')
-    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
-        return complain('demo', f'failed unexpectedly: {with_place(error)}')
+
+    def work() -> int:
+        try:
+            options.output.mkdir(parents=True, exist_ok=True)
+            return _run(options, stop)
+        except OSError as error:
+            place = error.filename or options.output
+            raise ValveflowError(f'{place}: {error.strerror}') from None
+
+    status = run('demo', [], work)
     if stop:
         tell('Stopped; nothing is left running.')
     return status

@@ -12,33 +12,52 @@ load. It then continues with the participant that has discovered the most neighb
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import contextmanager
 
 import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context, get_rmw_implementation_identifier
 
 from valveflow_ros.errors import InputError, ValveflowError
-from valveflow_ros.ros.process import one_line
+from valveflow_ros.ros.process import complain, one_line, with_place
 
 _FAST_DDS = ('rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
 
 
-def start_ros(args: Sequence[str] | None) -> None:
-    """Choose the transport, check security and initialise the default context.
+def run(executable: str, args: Sequence[str] | None, work: Callable[[], int]) -> int:
+    """Start ROS and work until the end; return the exit status.
 
-    Raises
-    ------
-    ValveflowError
-        If ROS could not be started, or required security is not available.
+    Each error is printed as a sentence with the name of the executable.
     """
-    choose_transport()
-    check_security(args)
-    _initialise(args)
+    try:
+        choose_transport()
+        check_security(args)
+        _initialise(args)
+        return work()
+    except ValveflowError as error:
+        return complain(executable, str(error))
+    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
+        return complain(executable, f'failed unexpectedly: {with_place(error)}')
+    finally:
+        rclpy.try_shutdown()
+
+
+@contextmanager
+def spinning(node: Node) -> Iterator[SingleThreadedExecutor]:
+    """Give an executor for a node; both end with the block."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(timeout_sec=0.5)
+        node.destroy_node()
 
 
 def _initialise(args: Sequence[str] | None) -> None:
@@ -73,14 +92,7 @@ def choose_transport(
 
     If discovery is limited to this host, ROS adds shared memory in any case. Then the profile
     `config/fastdds_loopback.xml` replaces this limit. It also limits discovery to this host, and
-    binds its sockets to 127.0.0.1.
-
-    Parameters
-    ----------
-    environ : mutable mapping, optional
-        By default the environment of the process. ROS reads it when the first node is created.
-    middleware : str, optional
-        The name of the ROS middleware; by default the one in use.
+    binds its sockets to 127.0.0.1. ROS reads the environment when the first node is created.
     """
     environ = os.environ if environ is None else environ
     middleware = get_rmw_implementation_identifier() if middleware is None else middleware
@@ -129,13 +141,6 @@ def check_security(
     args: Sequence[str] | None = None, environ: Mapping[str, str] | None = None
 ) -> None:
     """Check that a node can be created with security, if security is required.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        The arguments for `rclpy.init`, which may name an enclave.
-    environ : mapping, optional
-        Environment variables; by default those of the process.
 
     Raises
     ------

@@ -52,7 +52,7 @@ VERDICTS = {
 
 def to_time(time_ns: int) -> Time:
     """Return a stamp; times before 1970 or after 2038 are clipped to the nearest valid one."""
-    sec, nanosec = divmod(min(max(time_ns, 0), LAST_NS), NS_PER_S)
+    sec, nanosec = _seconds(time_ns)
     return Time(sec=sec, nanosec=nanosec)
 
 
@@ -92,6 +92,18 @@ def journal_message(entry: engine.JournalEntry, tag: str) -> JournalEntry:
     )  # fmt: skip
 
 
+# Arrays of a curve's message: field, records of the curve, their field.
+_COLUMNS = (
+    ('slopes', 'pieces', 'slope'), ('intercepts', 'pieces', 'intercept'),
+    ('slope_stderr', 'pieces', 'slope_stderr'), ('intercept_stderr', 'pieces', 'intercept_stderr'),
+    ('region_power_from', 'dynamics', 'power_from'), ('region_power_to', 'dynamics', 'power_to'),
+    ('time_constants', 'dynamics', 'time_constant_s'), ('delays', 'dynamics', 'delay_s'),
+    ('time_constant_stderr', 'dynamics', 'time_constant_stderr_s'),
+    ('delay_stderr', 'dynamics', 'delay_stderr_s'),
+    ('power_to_stderr', 'dynamics', 'power_to_stderr_mw'),
+)  # fmt: skip
+
+
 def curve_message(
     curve: Characteristic | None,
     status: CurveStatus,
@@ -110,47 +122,33 @@ def curve_message(
     )  # fmt: skip
     if curve is None:
         return message
-    source, pieces, dynamics, choice = curve.source, curve.pieces, curve.dynamics, curve.choice
-    message.model_id = curve.model_id
-    message.window_start = to_time(source.window_start_ns)
-    message.window_end = to_time(source.window_end_ns)
-    message.breakpoints = curve.breakpoints.tolist()
-    message.values = curve.values().tolist()
-    message.pieces = len(pieces)
-    message.slopes = [p.slope for p in pieces]
-    message.intercepts = [p.intercept for p in pieces]
-    message.slope_stderr = [p.slope_stderr for p in pieces]
-    message.intercept_stderr = [p.intercept_stderr for p in pieces]
+    source, choice = curve.source, curve.choice
+    message.breakpoints, message.values = curve.breakpoints.tolist(), curve.values().tolist()
     message.breakpoint_low = [low for low, _ in curve.breakpoint_intervals]
     message.breakpoint_high = [high for _, high in curve.breakpoint_intervals]
-    message.region_power_from = [d.power_from for d in dynamics]
-    message.region_power_to = [d.power_to for d in dynamics]
-    message.time_constants = [d.time_constant_s for d in dynamics]
-    message.delays = [d.delay_s for d in dynamics]
-    message.time_constant_stderr = [d.time_constant_stderr_s for d in dynamics]
-    message.delay_stderr = [d.delay_stderr_s for d in dynamics]
-    message.power_to_stderr = [d.power_to_stderr_mw for d in dynamics]
+    for name, records, of in _COLUMNS:
+        setattr(message, name, [getattr(record, of) for record in getattr(curve, records)])
     # Omega(J), Lambda(J) and the confidence of J, for J = 1, 2, ...
     numbers = range(1, max(choice.cost, default=0) + 1)
     message.cost = [choice.cost.get(j, nan) for j in numbers]
     message.turning_angle = [choice.turning_angle.get(j, nan) for j in numbers]
     likely = choice.confidence
     message.confidence = [likely.get(j, 0.0) for j in range(1, max(likely, default=0) + 1)]
-    message.pressure_exponent = curve.pressure_exponent
-    message.axis = curve.axis
-    message.pressure_scale_exponent = curve.pressure_scale_exponent
-    message.offset_mw = curve.offset_mw
+    message.window_start = to_time(source.window_start_ns)
+    message.window_end = to_time(source.window_end_ns)
+    for name in ('model_id', 'pressure_exponent', 'axis', 'pressure_scale_exponent', 'offset_mw'):
+        setattr(message, name, getattr(curve, name))
+    for name in ('samples', 'temperature_mean_degc', 'temperature_flag'):
+        setattr(message, name, getattr(source, name))
+    message.pieces = pieces = len(curve.pieces)
     message.reference_pressure_mpa = curve.shown_at_mpa
-    message.samples = source.samples
     message.steady_segments = source.steady
     message.slope_segments = source.slope_response
     message.rmse_mw = curve.residuals.rmse_mw
-    message.temperature_mean_degc = source.temperature_mean_degc
     message.temperature_spread_degc = source.temperature_spread_k
-    message.temperature_flag = source.temperature_flag
     if reference_id and shift is None:
         # The shift of the reference itself is 0; that of an uncompared curve is NaN.
-        message.shift_mw = [0.0 if curve.model_id == reference_id else nan] * len(pieces)
+        message.shift_mw = [0.0 if curve.model_id == reference_id else nan] * pieces
         message.shift_confidence = list(message.shift_mw)
     elif reference_id and shift is not None:
         message.shift_sentence = shift.sentence
@@ -232,20 +230,19 @@ def diagnosis_message(
 
 def _cause_message(cause: Mapping[str, Any]) -> DiagnosisCause:
     parameters, gain = cause['parameters'], cause['gain']
+    columns = {
+        f'parameter_{name}s': [_number(p[name]) for p in parameters.values()]
+        for name in ('value', 'low', 'high')
+    }
     return DiagnosisCause(
-        name=str(cause['name']),
-        sentence=str(cause['sentence']),
-        meaning=str(cause.get('meaning', '')),
-        to_do=str(cause.get('to_do', '')),
+        **{name: str(cause[name]) for name in ('name', 'sentence')},
+        **{name: str(cause.get(name, '')) for name in ('meaning', 'to_do')},
+        **columns,
         parameter_names=[str(name) for name in parameters],
-        parameter_values=[_number(p['value']) for p in parameters.values()],
-        parameter_lows=[_number(p['low']) for p in parameters.values()],
-        parameter_highs=[_number(p['high']) for p in parameters.values()],
         parameter_units=[str(p['unit']) for p in parameters.values()],
         rmse_before_mw=_number(gain['rmse_before']),
         rmse_after_mw=_number(gain['rmse_after']),
-        reduction=_number(gain['reduction']),
-        p_value=_number(gain['p_value']),
+        **{name: _number(gain[name]) for name in ('reduction', 'p_value')},
     )
 
 

@@ -10,21 +10,21 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Header
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, PlantSample
 
-from valveflow_ros.errors import InputError, ValveflowError, counted
+from valveflow_ros.errors import InputError, counted
 from valveflow_ros.logs.mcap.importing import write_readings
 from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
 from valveflow_ros.opcua.link import Link
@@ -35,12 +35,18 @@ from valveflow_ros.opcua.sampler import Counts, Sample, Sampler
 from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.parameters import Parameter
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Readings, Signal
-from valveflow_ros.ros.declare import declare, unknown_overrides
+from valveflow_ros.ros.declare import declare_all
 from valveflow_ros.ros.decoding import PLANT_SAMPLE, from_time
-from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.domain import run, spinning
 from valveflow_ros.ros.encoding import header
-from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
-from valveflow_ros.ros.process import StopFlag, complain, show, usage, wants_help, with_place
+from valveflow_ros.ros.node.diagnostics import (
+    Changes,
+    Item,
+    Level,
+    diagnostics_message,
+    log_at,
+)
+from valveflow_ros.ros.process import StopFlag, show, usage, wants_help
 
 NAME = 'opcua_gateway'
 TABLE: tuple[Parameter, ...] = (
@@ -72,6 +78,11 @@ class LoopThread:
         """Start a coroutine in the loop."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
+    def finish(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> None:
+        """Run a last coroutine to its end, for a limited time, whatever it raises."""
+        with suppress(Exception):
+            self.start(work()).result(_END_S + 1.0)
+
     def close(self) -> None:
         """Cancel all tasks, let them close their sessions, and end the thread."""
 
@@ -81,20 +92,13 @@ class LoopThread:
                 task.cancel()
             await asyncio.wait(others, timeout=_END_S) if others else None
 
-        with suppress(Exception):
-            self.start(cancel()).result(_END_S + 1.0)
+        self.finish(cancel)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(1.0)
 
 
 class GatewayUnit:
-    """One unit: its link runs in the loop's thread, its sampler in the node's thread.
-
-    Parameters
-    ----------
-    node : Node
-    unit : UnitMapping
-    """
+    """One unit: its link runs in the loop's thread, its sampler in the node's thread."""
 
     def __init__(self, node: Node, unit: UnitMapping) -> None:
         self.unit = unit
@@ -202,13 +206,7 @@ class GatewayUnit:
 class ResultsBridge:
     """Forwards what a unit's monitor publishes to the OPC UA server.
 
-    Parameters
-    ----------
-    node : Node
-    unit : UnitMapping
-    server : ResultsServer
-    start : callable
-        Starts a coroutine in the server's loop.
+    ``start`` starts a coroutine in the server's loop.
     """
 
     OBJECTS = ('characteristic', 'diagnosis', *(
@@ -233,21 +231,17 @@ class ResultsBridge:
 
     def look(self) -> None:
         """Update the status of the shown values if the monitor has ended or is back."""
-        present = self._node.count_publishers(f'{self._monitor}/characteristic') > 0
+        self._note(self._node.count_publishers(f'{self._monitor}/characteristic') > 0)
+
+    def _note(self, present: bool) -> None:
         if present != self._present:
             self._present = present
             self._start(self._server.mark(self._tag, present))
 
-    def _heard(self) -> None:
-        """Note that the monitor is back, because a message was received."""
-        if not self._present:
-            self._present = True
-            self._start(self._server.mark(self._tag, True))
-
     def _on_message(self, name: str, message: Any) -> None:
-        self._heard()
+        self._note(True)
         time_ns = from_time(message.header.stamp)
-        self._start(self._server.update(self._tag, name, variables(message), time_ns))
+        self._start(self._server.update(self._tag, name, values_of(message), time_ns))
         if name == 'diagnosis' and message.verdict != Diagnosis.UNKNOWN:
             values = {'State': message.verdict, 'PreviousState': 0, 'Value': math.nan,
                       'Limit': math.nan, 'Unit': ''}  # fmt: skip
@@ -260,8 +254,8 @@ class ResultsBridge:
         time_ns, name = from_time(message.header.stamp), f'alarms.{message.name}'
         if name not in self.OBJECTS:
             return
-        self._heard()
-        self._start(self._server.update(self._tag, name, variables(message), time_ns))
+        self._note(True)
+        self._start(self._server.update(self._tag, name, values_of(message), time_ns))
         # A repeated announcement is no event.
         if message.state == message.previous_state:
             return
@@ -275,44 +269,40 @@ class ResultsBridge:
         self._start(self._server.alarm(self._tag, event))
 
 
-def fields(kind: Any) -> Iterable[Field]:
-    """Yield the variables of a message type: one per field, with its name."""
+def variables(kind: Any, message: Any = None) -> Iterator[tuple[Field, object]]:
+    """Yield the variables of a message type, one per field, and its value, with times in ns.
+
+    A field with causes gives a variable for each of their plain fields, which has a value for
+    each cause.
+    """
     for name, of in kind.get_fields_and_field_types().items():
-        if of == 'std_msgs/Header':
-            yield Field('stamp', 'DateTime')
-        elif of == _TIME:
-            yield Field(name, 'DateTime')
+        value = getattr(message, name, None)
+        if of in ('std_msgs/Header', _TIME):
+            stamp = value.stamp if isinstance(value, Header) else value
+            time_ns = None if stamp is None else from_time(stamp)
+            yield Field(name if of == _TIME else 'stamp', 'DateTime'), time_ns
         elif of == _CAUSES:
-            for inner in fields(DiagnosisCause):
+            for inner, _ in variables(DiagnosisCause):
                 if not inner.array:
-                    yield Field(f'{name}_{inner.name}', inner.kind, True)
+                    found = [getattr(cause, inner.name) for cause in value or ()]
+                    yield Field(f'{name}_{inner.name}', inner.kind, True), found
         else:
             plain = of.removeprefix('sequence<').removesuffix('>')
-            yield Field(name, _KINDS[plain], plain != of)
+            array = plain != of
+            yield Field(name, _KINDS[plain], array), list(value or ()) if array else value
 
 
-def variables(message: Any) -> dict[str, object]:
-    """Return the values of the variables from `fields`; times are in ns."""
-    values: dict[str, object] = {}
-    types = message.get_fields_and_field_types()
-    for name, of in types.items():
-        value = getattr(message, name)
-        if of == 'std_msgs/Header':
-            values['stamp'] = from_time(value.stamp)
-        elif of == _TIME:
-            values[name] = from_time(value)
-        elif of == _CAUSES:
-            for inner in fields(DiagnosisCause):
-                if not inner.array:
-                    values[f'{name}_{inner.name}'] = [getattr(c, inner.name) for c in value]
-        else:
-            values[name] = list(value) if of.startswith('sequence<') else value
-    return values
+def values_of(message: Any) -> dict[str, object]:
+    """Return the values of the variables of a message by name."""
+    return {field.name: value for field, value in variables(type(message), message)}
 
 
 def _units_offered(mapping: GatewayMapping) -> dict[str, dict[str, list[Field]]]:
     kinds = {'characteristic': FlowCharacteristic, 'diagnosis': Diagnosis}
-    objects = {name: list(fields(kinds.get(name, Alarm))) for name in ResultsBridge.OBJECTS}
+    objects = {
+        name: [field for field, _ in variables(kinds.get(name, Alarm))]
+        for name in ResultsBridge.OBJECTS
+    }
     return {unit.tag: objects for unit in mapping.units}
 
 
@@ -329,53 +319,34 @@ def main(args: Sequence[str] | None = None) -> int:
         show(usage(_ABOUT, _EXAMPLE, TABLE))
         return 0
     stop = StopFlag().install()
-    try:
-        check_installed()
-        start_ros(args)
-        return _run(stop)
-    except ValveflowError as error:
-        return complain(NAME, str(error))
-    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
-        return complain(NAME, f'failed unexpectedly: {with_place(error)}')
-    finally:
-        rclpy.try_shutdown()
+    return run(NAME, args, lambda: _run(stop))
 
 
 def _run(stop: StopFlag) -> int:
+    check_installed()
     node = Node(NAME)
-    loop = LoopThread()
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    server: ResultsServer | None = None
-    try:
-        values = declare(node, TABLE)
+    with ExitStack() as stack:
+        executor = stack.enter_context(spinning(node))
+        loop = LoopThread()
+        stack.callback(loop.close)
+        stack.callback(stop.last)
+        values = declare_all(node, TABLE)
         log = node.get_logger()
-        for sentence in unknown_overrides(node, list(values)):
-            log.warning(f'{sentence} It is ignored.')
         if not values['mapping_file']:
             raise InputError('Name the mapping file: --ros-args -p mapping_file:=opcua.yaml.')
         mapping = read_mapping_file(Path(str(values['mapping_file'])))
         bridges = []
         if mapping.server is not None:
-            offered = ResultsServer(mapping.server, _units_offered(mapping))
-            for sentence in loop.start(offered.start()).result(_OFFER_S):
+            server = ResultsServer(mapping.server, _units_offered(mapping))
+            for sentence in loop.start(server.start()).result(_OFFER_S):
                 log.warning(sentence)
-            server = offered
-            bridges = [ResultsBridge(node, unit, offered, loop.start) for unit in mapping.units]
+            stack.callback(loop.finish, server.stop)
+            bridges = [ResultsBridge(node, unit, server, loop.start) for unit in mapping.units]
             log.info(f'Curve, alarms and diagnosis are offered at {mapping.server.endpoint}.')
         units = [GatewayUnit(node, unit) for unit in mapping.units]
         for unit in units:
             loop.start(unit.link.run())
-        period_s = float(str(values['diagnostics_period']))
-        _serve(node, executor, stop, units, bridges, period_s)
-    finally:
-        stop.last()
-        if server is not None:
-            with suppress(Exception):
-                loop.start(server.stop()).result(_END_S)
-        loop.close()
-        executor.shutdown(timeout_sec=0.5)
-        node.destroy_node()
+        _serve(node, executor, stop, units, bridges, float(str(values['diagnostics_period'])))
     return 0
 
 
@@ -406,14 +377,7 @@ def _serve(
             publisher.publish(diagnostics_message(items, unit.name, unit.unit.tag, now_ns))
             fresh = (item for item in items if item.level != Level.STALE)
             for item in changes[unit.name].pick(fresh, now_s):
-                told = f'{unit.unit.tag}, {item.name}: {item.sentence}'
-                # Separate calls: rclpy allows only one severity per line of code.
-                if item.level == Level.OK:
-                    log.info(told)
-                elif item.level == Level.WARN:
-                    log.warning(told)
-                else:
-                    log.error(told)
+                log_at(log, item.level, f'{unit.unit.tag}, {item.name}: {item.sentence}')
 
 
 if __name__ == '__main__':

@@ -54,13 +54,7 @@ def waiting_for(monitor: str) -> str:
 class Listener:
     """Subscribes to one monitor and updates a board.
 
-    Parameters
-    ----------
-    node : Node
-    monitor : str
-        Full name of the monitor's node.
-    board : MonitorState
-        Call `tell` before reading it.
+    ``monitor`` is the full name of its node. Call `tell` before reading the board.
     """
 
     def __init__(self, node: Node, monitor: str, board: MonitorState) -> None:

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor
+from rclpy.node import Node
 from valveflow_msgs.msg import PlantSample
 
 from valveflow_ros.errors import ValveflowError
@@ -28,8 +29,8 @@ from valveflow_ros.opcua.results_server import read_results
 from valveflow_ros.opcua.session import check_installed
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.ros.demo import Process, tell
-from valveflow_ros.ros.domain import start_ros
-from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
+from valveflow_ros.ros.domain import run, spinning
+from valveflow_ros.ros.process import Parser, StopFlag
 
 _HOURS = 6.0
 _PATIENCE_S = 180.0
@@ -44,22 +45,15 @@ class _Stopped(Exception):  # noqa: N818 - it is no error
 class Demo:
     """Runs the processes of the demo and subscribes to their topics.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder for logs, the mapping, the recording and the report.
-    stop : StopFlag
+    Logs, the mapping, the recording and the report go to ``folder``.
     """
 
-    def __init__(self, folder: Path, stop: StopFlag) -> None:
-        self._folder, self._stop = folder, stop
+    def __init__(self, node: Node, executor: Executor, folder: Path, stop: StopFlag) -> None:
+        self._executor, self._folder, self._stop = executor, folder, stop
         self._sample: PlantSample | None = None
         self._link = ''
-        self._node = rclpy.create_node('opcua_demo')
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
-        self._node.create_subscription(PlantSample, '/plant_sample', self._on_sample, 10)
-        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
+        node.create_subscription(PlantSample, '/plant_sample', self._on_sample, 10)
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
         self._port, self._offered = _free_port(), _free_port()
 
     def run(self) -> None:
@@ -89,11 +83,6 @@ class Demo:
             self._until(lambda: 'Connected' in self._link and self._good(), 'the link')
             tell(f'It is started again. /diagnostics: {self._link}')
             self._import(mapping)
-
-    def close(self) -> None:
-        """Destroy the node."""
-        self._executor.shutdown(timeout_sec=0.5)
-        self._node.destroy_node()
 
     def _import(self, mapping: Path) -> None:
         end = datetime.now(timezone.utc)
@@ -160,10 +149,8 @@ class Demo:
                 self._link = status.message
 
     def _write_mapping(self) -> Path:
-        units = {'%': '%', 'MPa': 'MPa', 'degC': 'degC', 'MW': 'MW'}
         signals = {
-            i.topic: {'node': f'nsu={NAMESPACE};s={i.topic}', 'unit': units[i.unit]}
-            for i in SIGNALS
+            i.topic: {'node': f'nsu={NAMESPACE};s={i.topic}', 'unit': i.unit} for i in SIGNALS
         }
         path = self._folder / 'opcua.yaml'
         path.write_text(json.dumps({  # JSON is YAML
@@ -188,24 +175,20 @@ def main(args: Sequence[str] | None = None) -> int:
     )
     options: argparse.Namespace = parser.parse_args(args)
     stop = StopFlag().install()
+    return run('opcua_demo', [], lambda: _run(options.output.resolve(), stop))
+
+
+def _run(folder: Path, stop: StopFlag) -> int:
+    check_installed()
     try:
-        check_installed()
-        folder = options.output.resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        start_ros([])
-        demo = Demo(folder, stop)
-        try:
-            demo.run()
-        finally:
-            demo.close()
+        node = rclpy.create_node('opcua_demo')
+        with spinning(node) as executor:
+            Demo(node, executor, folder, stop).run()
     except _Stopped:
         return 130
-    except (ValveflowError, OSError) as error:
-        return complain('opcua_demo', str(error))
-    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
-        return complain('opcua_demo', f'failed unexpectedly: {with_place(error)}')
-    finally:
-        rclpy.try_shutdown()
+    except OSError as error:
+        raise ValveflowError(str(error)) from None
     return 0
 
 

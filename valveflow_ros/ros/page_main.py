@@ -15,20 +15,18 @@ from concurrent.futures import TimeoutError as NoAnswer
 from typing import Any
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 from valveflow_msgs.srv import OperateAlarm
 
-from valveflow_ros.errors import ValveflowError
 from valveflow_ros.page.notices import Notices
 from valveflow_ros.page.server import PageServer, check_installed, page_arguments, read_token
 from valveflow_ros.page.unit import MOST_UNITS, AlarmChange, Shown, Snapshot, Unit
 from valveflow_ros.records import zone_of
 from valveflow_ros.report.terminal.text import zone_argument
-from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.domain import run, spinning
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
-from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
+from valveflow_ros.ros.process import Parser, StopFlag
 
 # Period of updates of the page, and of the search for monitors.
 _SHOW_S, _LOOK_S = 0.5, 2.0
@@ -38,10 +36,7 @@ _ANSWER_S = 10.0
 class PageNode(Node):
     """Subscribes to all running monitors, or to the named ones.
 
-    Parameters
-    ----------
-    wanted : sequence of str
-        Node names of monitors; if empty, all that are found, at most `MOST_UNITS`.
+    Without names these are all that are found, at most `MOST_UNITS`.
     """
 
     def __init__(self, wanted: Sequence[str] = ()) -> None:
@@ -79,11 +74,7 @@ class PageNode(Node):
     def ask(self, monitor: str, asked: str) -> tuple[bool, str]:
         """Request an action on an alarm from a monitor; return success and a sentence.
 
-        Parameters
-        ----------
-        monitor : str
-        asked : str
-            Action and alarm, such as 'shelve residual'. May be called from any thread.
+        ``asked`` is action and alarm, such as 'shelve residual'. May be called from any thread.
         """
         answer: Future[tuple[bool, str]] = Future()
         try:
@@ -150,16 +141,7 @@ def main(args: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv if args is None else ['page', *args])
     options = parser().parse_args(remove_ros_args(arguments)[1:])
     stop = StopFlag().install()
-    try:
-        check_installed()
-        start_ros(arguments)
-        return _run(options, stop)
-    except ValveflowError as error:
-        return complain('page', str(error))
-    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
-        return complain('page', f'failed unexpectedly: {with_place(error)}')
-    finally:
-        rclpy.try_shutdown()
+    return run('page', arguments, lambda: _run(options, stop))
 
 
 def _say(sentence: str) -> None:
@@ -167,23 +149,24 @@ def _say(sentence: str) -> None:
 
 
 def _run(options: argparse.Namespace, stop: StopFlag) -> int:
+    check_installed()
     shown = Shown()
     shown.put((), waiting_for(' and '.join(map(full_name, options.node))))
-    notices = Notices(options.on_alarm, options.webhook, _say)
     node = PageNode(options.node)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    server: PageServer | None = None
-    try:
+    with contextlib.ExitStack() as stack:
+        executor = stack.enter_context(spinning(node))
+        notices = stack.enter_context(
+            contextlib.closing(Notices(options.on_alarm, options.webhook, _say))
+        )
         asking = None
         if options.token_file is not None:
             from valveflow_ros.page.view import Asking
 
             asking = Asking(read_token(options.token_file), node.ask)
-        server = PageServer(
+        server = stack.enter_context(contextlib.closing(PageServer(
             shown, options.host, options.port, options.name, asking, notices.counters, _say,
             zone_of(options.time_zone),
-        )  # fmt: skip
+        )))  # fmt: skip
         _say(f'The page is at {server.address}')
         looked_s = -_LOOK_S
         while not stop:
@@ -195,12 +178,6 @@ def _run(options: argparse.Namespace, stop: StopFlag) -> int:
                 executor.spin_once(timeout_sec=min(left_s, 0.1))
                 node.pass_on()
             notices.tell(node.show(shown))
-    finally:
-        if server is not None:
-            server.close()
-        notices.close()
-        executor.shutdown(timeout_sec=0.5)
-        node.destroy_node()
     return 0
 
 

@@ -23,6 +23,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import Prediction
 
+from valveflow_ros.errors import counted
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
 from valveflow_ros.ros.encoding import clock_bytes
 from valveflow_ros.ros.node.polled_subscription import PolledSubscription
@@ -84,7 +85,6 @@ class Player:
             for name in names
         }
         self._clock = node.create_publisher(Clock, '/clock', qos) if use_clock else None
-        self.sent: dict[str, int] = dict.fromkeys(self.publishers, 0)
         self._window = max(_LEAST_STEPS, _MAX_UNANSWERED // (len(self.publishers) + use_clock))
         self._predictions: list[PolledSubscription] = []
         self._unanswered: deque[int] = deque()
@@ -95,12 +95,7 @@ class Player:
     def wait_for_listeners(self, patience_s: float) -> list[str]:
         """Wait until every input has a subscriber; return the topics that have none.
 
-        Nobody needs to listen to a covariate.
-
-        Parameters
-        ----------
-        patience_s : float
-            Maximum wait in s; 0 does not wait.
+        Nobody needs to listen to a covariate. A ``patience_s`` of 0 does not wait.
         """
         begun_s = time.monotonic()
         missing = self._without_listener()
@@ -109,10 +104,12 @@ class Player:
             missing = self._without_listener()
         if len(missing) < len(self.publishers):
             self._sleep_until(time.monotonic() + _SETTLE_S)
+        if missing and patience_s > 0 and not self._stop():
+            self._node.get_logger().warning(f'Nobody listens to {", ".join(missing)}.')
         return missing
 
-    def play(self, steps: Iterable[Step]) -> int:
-        """Publish steps until they end or ``stop`` returns True; return their number."""
+    def play(self, steps: Iterable[Step], what: str = 'sample') -> None:
+        """Publish steps until they end or ``stop`` returns True; log their number."""
         self._find_predictions()
         log = self._node.get_logger()
         if self._predictions:
@@ -120,8 +117,8 @@ class Player:
             log.info(f'Sending no faster than {topics} answers.')
         elif self._rate == 0:
             log.info('Nobody predicts, so there is nobody to follow: 1000 samples a second.')
-        done = 0
-        first_ns, begun_s = 0, time.monotonic()
+        done = sent = first_ns = 0
+        begun_s = time.monotonic()
         for step in steps:
             if done == 0:
                 first_ns = step.time_ns
@@ -134,12 +131,13 @@ class Player:
                 self._clock.publish(clock_bytes(step.time_ns))
             for name, data in step.messages:
                 self.publishers[name].publish(data)
-                self.sent[name] += 1
+            sent += len(step.messages)
             self._unanswered.append(step.time_ns)
             done += 1
         for publisher in self.publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=_SETTLE_S))
-        return done
+        end = 'Stopped' if self._stop() else 'Finished'
+        log.info(f'{end} after {counted(done, what)}, {counted(sent, "message")}.')
 
     def _without_listener(self) -> list[str]:
         return [

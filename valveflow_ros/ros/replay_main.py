@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from operator import itemgetter
 
-import rclpy
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
@@ -29,7 +28,7 @@ from valveflow_ros.ros.decoding import (
     header_time_ns,
     with_todays_codes,
 )
-from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.domain import run
 from valveflow_ros.ros.encoding import float64_bytes
 from valveflow_ros.ros.node.recording import TOPICS
 from valveflow_ros.ros.player import Player, Step
@@ -150,10 +149,11 @@ def main(args: Sequence[str] | None = None) -> int:
     """Replay or verify; return the exit status."""
     arguments = list(sys.argv if args is None else ['replay', *args])
     options = parser().parse_args(remove_ros_args(arguments)[1:])
+    if not options.verify:
+        stop = StopFlag().install()
+        return run('replay', arguments, lambda: _replay(options, stop))
     try:
-        if options.verify:
-            return _verify(options.log)
-        return _replay(options, arguments)
+        return _verify(options.log)
     except ValveflowError as error:
         return complain('replay', str(error))
     except KeyboardInterrupt:
@@ -187,9 +187,7 @@ def _verify(path: str) -> int:
     return 0 if result.identical else 1
 
 
-def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
-    stop = StopFlag().install()
-    start_ros(arguments)
+def _replay(options: argparse.Namespace, stop: StopFlag) -> int:
     node: Node | None = None
     try:
         log = open_log(options.log)
@@ -200,22 +198,16 @@ def _replay(options: argparse.Namespace, arguments: list[str]) -> int:
             say.warning(warning)
         player = Player(node, names, options.rate, not options.no_clock, lambda: bool(stop))
         missing = player.wait_for_listeners(options.wait)
-        if missing and options.wait > 0 and not stop:
-            say.warning(f'Nobody listens to {", ".join(missing)}.')
-            if len(missing) == len(names):
-                say.error(f'Nobody listened within {options.wait:g} s; nothing was played.')
-                return 1
+        if missing and len(missing) == len(names) and options.wait > 0 and not stop:
+            say.error(f'Nobody listened within {options.wait:g} s; nothing was played.')
+            return 1
         say.info(f'Playing {options.log} on {", ".join(names)}.')
-        count = player.play(steps)
-        total = sum(player.sent.values())
-        end = 'Stopped' if stop else 'Finished'
-        say.info(f'{end} after {counted(count, "instant")}, {counted(total, "message")}.')
+        player.play(steps, 'instant')
         return 0
     finally:
         stop.last()
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
 
 
 if __name__ == '__main__':

@@ -10,22 +10,21 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, timezone
 from typing import cast
 
-import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from valveflow_msgs.msg import PlantSample
 
-from valveflow_ros.errors import ParameterError, ValveflowError, counted
+from valveflow_ros.errors import ParameterError, counted
 from valveflow_ros.parameters import Parameter
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate_parts
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import N_SIGNALS, NS_PER_S, SIGNALS, SampleTable, Signal
-from valveflow_ros.ros.declare import declare, unknown_overrides
+from valveflow_ros.ros.declare import declare_all
 from valveflow_ros.ros.decoding import PLANT_SAMPLE
-from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.domain import run
 from valveflow_ros.ros.encoding import encode, float64_bytes, header
 from valveflow_ros.ros.player import Player, Step
-from valveflow_ros.ros.process import StopFlag, complain, show, usage, wants_help, with_place
+from valveflow_ros.ros.process import StopFlag, show, usage, wants_help
 
 TABLE: tuple[Parameter, ...] = (
     Parameter('days', 10.0, 'd', 'How long the plant is simulated.', 0.001, 400.0),
@@ -45,27 +44,13 @@ TABLE: tuple[Parameter, ...] = (
 def effects_of(texts: Iterable[str]) -> list[EffectSpec]:
     """Read effects; a text may hold several, with semicolons between them.
 
-    Raises
-    ------
-    InputError
-        If an effect is unknown or its parameters are invalid.
+    Raises `InputError` if an effect is unknown or its parameters are invalid.
     """
-    return [
-        EffectSpec.parse(text)
-        for together in texts
-        for text in together.split(';')
-        if text.strip()
-    ]
+    return [EffectSpec.parse(text) for text in ';'.join(texts).split(';') if text.strip()]
 
 
 def start_ns_of(text: str, rate: float, now_ns: int) -> int:
-    """Return the time of the first sample.
-
-    Raises
-    ------
-    ParameterError
-        If the text is no time.
-    """
+    """Return the time of the first sample; raises `ParameterError` if the text is no time."""
     if not text.strip():
         return now_ns - now_ns % NS_PER_S if rate == 1.0 else DEFAULT_START_NS
     try:
@@ -80,13 +65,7 @@ def start_ns_of(text: str, rate: float, now_ns: int) -> int:
 
 
 def check_together(rate: float, stamped: bool, use_clock: bool) -> None:
-    """Refuse plain values in simulated time without a clock or stamps.
-
-    Raises
-    ------
-    ParameterError
-        If the times of the samples would be lost.
-    """
+    """Refuse plain values in simulated time without a clock or stamps: their times were lost."""
     if rate != 1.0 and not stamped and not use_clock:
         raise ParameterError(
             'rate',
@@ -153,31 +132,23 @@ def main(args: Sequence[str] | None = None) -> int:
         show(f'  {"effects":28} []\n  {"":28} {_EFFECTS.description}')
         return 0
     stop = StopFlag().install()
-    try:
-        start_ros(args)
-    except ValveflowError as error:
-        return complain('plant_simulator', str(error))
+    return run('plant_simulator', args, lambda: _run(stop))
+
+
+def _run(stop: StopFlag) -> int:
     node = Node('plant_simulator')
     try:
-        return _run(node, stop)
-    except ValveflowError as error:
-        return complain('plant_simulator', str(error))
-    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
-        return complain('plant_simulator', f'failed unexpectedly: {with_place(error)}')
+        return _play(node, stop)
     finally:
         stop.last()
         node.destroy_node()
-        rclpy.try_shutdown()
 
 
-def _run(node: Node, stop: StopFlag) -> int:
-    values = declare(node, TABLE)
+def _play(node: Node, stop: StopFlag) -> int:
+    values = declare_all(node, TABLE, 'effects')
     days, seed = cast(float, values['days']), cast(int, values['seed'])
     rate, wait_s = cast(float, values['rate']), cast(float, values['wait'])
     effects = effects_of(_texts(node.declare_parameter('effects', [], _EFFECTS).value))
-    log = node.get_logger()
-    for sentence in unknown_overrides(node, [*values, 'effects']):
-        log.warning(f'{sentence} It is ignored.')
     check_together(rate, bool(values['stamped']), bool(values['use_clock']))
     start_ns = start_ns_of(str(values['start']), rate, time.time_ns())
     parts = simulate_parts(days, seed, start_ns=start_ns, effects=effects)
@@ -190,16 +161,12 @@ def _run(node: Node, stop: StopFlag) -> int:
         names = [i.topic for i in SIGNALS if command or i.signal != Signal.VALVE_COMMAND]
         steps = plain_steps(tables, command)
     player = Player(node, names, rate, bool(values['use_clock']), lambda: bool(stop))
-    missing = player.wait_for_listeners(wait_s)
-    if missing and wait_s > 0 and not stop:
-        log.warning(f'Nobody listens to {", ".join(missing)}.')
+    player.wait_for_listeners(wait_s)
     wrong = ', '.join(str(effect) for effect in effects) or 'nothing'
-    log.info(f'{counted(days, "day")} of plant, seed {seed}; wrong with it: {wrong}.')
-    count = player.play(steps)
-    end = 'Stopped' if stop else 'Finished'
-    log.info(
-        f'{end} after {counted(count, "sample")}, {counted(sum(player.sent.values()), "message")}.'
+    node.get_logger().info(
+        f'{counted(days, "day")} of plant, seed {seed}; wrong with it: {wrong}.'
     )
+    player.play(steps, 'sample')
     return 0
 
 

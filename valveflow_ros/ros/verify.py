@@ -74,12 +74,7 @@ class _DifferenceError(Exception):
 def verify(path: str | Path, progress: Callable[[float], None] = lambda _: None) -> Verification:
     """Compare a recording with its replay.
 
-    Parameters
-    ----------
-    path : str or Path
-        A recording of the monitor.
-    progress : callable
-        Called from time to time with the fraction of the inputs that was processed.
+    ``progress`` is called from time to time with the fraction of the inputs that was processed.
 
     Raises
     ------
@@ -113,10 +108,7 @@ def corrector_of_run(log: LogContents, settings: Settings) -> Corrector | None:
 def diagnose_in_process(task: DiagnosisTask) -> str:
     """Compute a diagnosis in a process like that of the run, so that all bits are equal.
 
-    Raises
-    ------
-    DataError
-        If there is no result.
+    Raises `DataError` if there is no result.
     """
     worker = DiagnosisWorker(task.settings.real('diagnosis_timeout'))
     try:

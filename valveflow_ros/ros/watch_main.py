@@ -14,24 +14,22 @@ from collections.abc import Sequence
 from datetime import tzinfo
 from typing import Any
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 from valveflow_msgs.srv import OperateAlarm
 
-from valveflow_ros.errors import ValveflowError
 from valveflow_ros.records import NS_PER_S, zone_of
 from valveflow_ros.report.terminal.board import CURVE, HEALTH, PREDICTION, MonitorState
 from valveflow_ros.report.terminal.frame import Frame
 from valveflow_ros.report.terminal.screen import Screen
 from valveflow_ros.report.terminal.text import number, zone_argument
 from valveflow_ros.report.words import duration
-from valveflow_ros.ros.domain import start_ros
+from valveflow_ros.ros.domain import run, spinning
 from valveflow_ros.ros.listening import Listener, full_name, hear_health, monitors, waiting_for
 from valveflow_ros.ros.node.outputs import SERVICES
-from valveflow_ros.ros.process import Parser, complain, with_place
+from valveflow_ros.ros.process import Parser, complain
 
 _LOOK_S = 0.5
 # For --once: maximum time to find a monitor, and then to receive its health.
@@ -44,10 +42,7 @@ _OF_ALARMS = '_alarms'
 class WatchNode(Node):
     """Finds the monitor, subscribes, and stores what the terminal view needs.
 
-    Parameters
-    ----------
-    monitor : str
-        Name of the monitor's node; empty for the only running monitor.
+    ``monitor`` is the name of its node; empty for the only running monitor.
     """
 
     def __init__(self, monitor: str = '') -> None:
@@ -136,11 +131,12 @@ def main(args: Sequence[str] | None = None) -> int:
         made.error('--ask and --once do not go together')
     if options.alarm and not str(options.ask).endswith(_OF_ALARMS):
         made.error('--alarm goes with --ask acknowledge_alarms, shelve_alarms or unshelve_alarms')
+    return run('watch', arguments, lambda: _shown(options))
+
+
+def _shown(options: argparse.Namespace) -> int:
     try:
-        start_ros(arguments)
         return _run(options)
-    except ValveflowError as error:
-        return complain('watch', str(error))
     except KeyboardInterrupt:
         # Ctrl-C is the normal end.
         return 0
@@ -148,28 +144,19 @@ def main(args: Sequence[str] | None = None) -> int:
         # The reader of the output has ended.
         sys.stdout = None  # type: ignore[assignment]
         return 0
-    except Exception as error:  # noqa: BLE001 - print a sentence instead of a traceback
-        return complain('watch', f'failed unexpectedly: {with_place(error)}')
-    finally:
-        rclpy.try_shutdown()
 
 
 def _run(options: argparse.Namespace) -> int:
-    node = WatchNode(options.node)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    try:
+    node, zone = WatchNode(options.node), zone_of(options.time_zone)
+    with spinning(node) as executor:
         if options.ask:
             return _ask(node, executor, options.ask, options.alarm)
         if options.once:
-            return _once(node, executor, options.json, zone_of(options.time_zone))
-        with Screen(sys.stdout, zone=zone_of(options.time_zone)) as screen:
+            return _once(node, executor, options.json, zone)
+        with Screen(sys.stdout, zone=zone) as screen:
             while True:
                 _listen(node, executor, options.interval)
                 screen.show(node.frame())
-    finally:
-        executor.shutdown(timeout_sec=0.5)
-        node.destroy_node()
 
 
 def _listen(node: WatchNode, executor: SingleThreadedExecutor, seconds: float) -> None:

@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
@@ -73,13 +74,20 @@ def _text(value: object) -> str:
     return f'{value:.6g}' if isinstance(value, float) else str(value)
 
 
+def log_at(logger: Any, level: Level, text: str) -> None:
+    """Log a text; separate calls, because rclpy allows only one severity per line of code."""
+    if level == Level.OK:
+        logger.info(text)
+    elif level == Level.ERROR:
+        logger.error(text)
+    else:
+        logger.warning(text)
+
+
 class Changes:
     """Selects the items to log: those whose level has changed.
 
-    Parameters
-    ----------
-    quiet_s : float
-        Minimum time in s between two log lines of an item, unless it becomes an error.
+    An item is logged again after ``quiet_s`` seconds at the earliest, unless it becomes an error.
     """
 
     def __init__(self, quiet_s: float = 30.0) -> None:
@@ -115,10 +123,9 @@ def line_of(event: Event) -> tuple[Level, str] | None:
     if isinstance(event, CurveAdopted):
         curve = event.characteristic
         knees = ', '.join(f'{u:.0f}' for u in curve.breakpoints[1:-1])
-        knees = f'breakpoints at u = {knees}' if knees else 'no breakpoint'
         return Level.OK, (
             f'new curve {curve.model_id}: {counted(len(curve.pieces), "piece")}, '
-            f'{knees}, '
+            f'{f"breakpoints at u = {knees}" if knees else "no breakpoint"}, '
             f'{counted(curve.source.samples, "special sample")}'
         )
     if isinstance(event, ReferenceSet):
@@ -129,16 +136,13 @@ def line_of(event: Event) -> tuple[Level, str] | None:
         content = json.loads(event.content)
         level = Level.OK if content['verdict'] == 'nothing' else Level.WARN
         return level, f'diagnosis: {content["sentence"]}'
-    return _journal_line(event) if isinstance(event, JournalEntry) else None
-
-
-def _journal_line(event: JournalEntry) -> tuple[Level, str] | None:
-    if event.kind == JournalKind.FIT_REFUSED:
-        return Level.WARN, f'no new curve: {event.text}'
-    if event.kind == JournalKind.RESET:
-        return Level.WARN, event.text
-    if event.kind == JournalKind.MISMATCH:
-        return Level.OK if event.text == FITS_AGAIN else Level.WARN, event.text
-    if event.kind == JournalKind.DIAGNOSE:
-        return Level.OK, f'diagnosis started: {event.text}'
-    return None
+    if not isinstance(event, JournalEntry):
+        return None
+    fits = event.text == FITS_AGAIN
+    lines = {
+        JournalKind.FIT_REFUSED: (Level.WARN, f'no new curve: {event.text}'),
+        JournalKind.RESET: (Level.WARN, event.text),
+        JournalKind.MISMATCH: (Level.OK if fits else Level.WARN, event.text),
+        JournalKind.DIAGNOSE: (Level.OK, f'diagnosis started: {event.text}'),
+    }
+    return lines.get(event.kind)

@@ -52,21 +52,9 @@ from valveflow_ros.state import State
 class LiveEngine:
     """Turns readings into events; each call processes complete rows.
 
-    Parameters
-    ----------
-    settings : Settings
-    fit_worker : Worker
-    diagnosis_worker : Worker, optional
-        Without it, diagnoses are requested but never finished.
-    corrector : Corrector, optional
-        Corrects the rows for known causes.
-
-    Attributes
-    ----------
-    aligner : Aligner
-    monitor : Monitor
-    last_fit_s, last_diagnosis_s : float or None
-        Duration of the last fit and of the last diagnosis in s; None before the first.
+    Without a ``diagnosis_worker``, diagnoses are requested but never finished. The ``corrector``
+    corrects the rows for known causes. `last_fit_s` and `last_diagnosis_s` are the durations of
+    the last ones in s, None before the first.
     """
 
     def __init__(
@@ -100,19 +88,18 @@ class LiveEngine:
     def poll(self) -> list[Event]:
         """Adopt or refuse the finished results of the workers; return the events."""
         events: list[Event] = []
-        monitor = self.monitor
         for outcome in self._fit_worker.poll():
             self.last_fit_s = outcome.seconds
             if isinstance(outcome.result, Characteristic):
-                events += monitor.adopt(outcome.request_ns, outcome.result)
+                events += self.monitor.adopt(outcome.request_ns, outcome.result)
             else:
-                events += monitor.refuse(outcome.request_ns, str(outcome.result))
+                events += self.monitor.refuse(outcome.request_ns, str(outcome.result))
         for outcome in self._diagnosis_worker.poll() if self._diagnosis_worker else ():
             self.last_diagnosis_s = outcome.seconds
             if isinstance(outcome.result, DiagnosisContent):
-                events += monitor.diagnosing.adopt(outcome.request_ns, outcome.result.text)
+                events += self.monitor.diagnosing.adopt(outcome.request_ns, outcome.result.text)
             else:
-                events += monitor.diagnosing.refuse(outcome.request_ns, str(outcome.result))
+                events += self.monitor.diagnosing.refuse(outcome.request_ns, str(outcome.result))
         return events
 
     def request_diagnosis(self) -> list[Event]:
@@ -209,15 +196,9 @@ def warm_up(settings: Settings, worker: FitWorker, stop: Callable[[], bool], wai
     The worker does the same in its process. If it fails, the monitor continues, and the first
     real fit reports the failure.
 
-    Parameters
-    ----------
-    settings : Settings
-    worker : FitWorker
-    stop : callable
-        Returns True to give up waiting.
-    wait : bool
-        If True, wait for the worker, too, if it has to compile. A monitor without a curve waits,
-        because it cannot predict before its first fit; one with a curve does not.
+    With ``wait``, wait for the worker, too, if it has to compile, unless ``stop`` returns True. A
+    monitor without a curve waits, because it cannot predict before its first fit; one with a
+    curve does not.
     """
     wait = wait and must_compile_to_fit()
     begun_s = time.monotonic()

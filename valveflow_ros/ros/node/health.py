@@ -33,18 +33,14 @@ from valveflow_ros.signals.units import better_units, unit_of
 
 _NO_LEAD = -(2**63)
 _FAR_BEHIND_NS = 120 * NS_PER_S
+_ONE_SERVER = 'set both by one server'
 
 
 @dataclass(frozen=True, slots=True)
 class Publishers:
     """The publishers of one topic.
 
-    Attributes
-    ----------
-    right : int
-        Number of publishers of the expected type.
-    wrong_types : tuple of str
-        Other types that are published on the same topic.
+    ``right`` have the expected type; ``wrong_types`` are published on the same topic, too.
     """
 
     right: int = 0
@@ -74,18 +70,9 @@ _BLIND_S = 10.0
 class InputHealth:
     """Rates the inputs by what has changed since the last call.
 
-    Parameters
-    ----------
-    settings : Settings
-    topics : mapping of str to str
-        Full topic name by contract name.
-    by_host : bool
-        True if the time of the plant is this machine's clock; False with a /clock.
-
-    Attributes
-    ----------
-    mismatched : set of str
-        Contract names of the topics with a publisher whose QoS is incompatible.
+    ``topics`` has the full topic names by contract name. ``by_host`` is True if the time of the
+    plant is this machine's clock, False with a /clock. Topics with a publisher whose QoS is
+    incompatible are added to ``mismatched`` from outside.
     """
 
     def __init__(
@@ -138,12 +125,10 @@ class InputHealth:
 
         Parameters
         ----------
-        statistics : mapping
-            Statistics by contract name of the topic.
+        statistics, publishers : mapping
+            By contract name of the topic.
         counts : mapping
             Number of readings by signal and by result (accepted or the reason of rejection).
-        publishers : mapping
-            Publishers in the ROS graph by contract name of the topic.
         now_s, listening_s : float
             Monotonic time, and time since the inputs were subscribed, in s.
         newest_ns : int
@@ -290,10 +275,11 @@ class InputHealth:
             off_ns = self._last_ns[info.signal] - self._newest_ns
             outliers = self._new(info.topic, 'time_outlier', counts['time_outlier'])
             if outliers and abs(off_ns) > self._jump_ns:
-                off = duration(abs(off_ns) / NS_PER_S)
-                if off_ns > 0:
-                    return f'The last stamp is {off} ahead of the newest one used.'
-                return f'The last stamp is {off} behind the newest one used.'
+                off, side = (
+                    duration(abs(off_ns) / NS_PER_S),
+                    'ahead of' if off_ns > 0 else 'behind',
+                )
+                return f'The last stamp is {off} {side} the newest one used.'
             if bad_quality:
                 return (
                     'The sender marked them as bad quality, or does not set '
@@ -331,17 +317,11 @@ class InputHealth:
             return '', ''
         off = duration(abs(lead_ns) / NS_PER_S)
         if lead_ns > 0:
-            ahead = (
-                f"Stamps are up to {off} ahead of this machine's clock; set both by one server."
-            )
-            return ahead, ''
+            return f"Stamps are up to {off} ahead of this machine's clock; {_ONE_SERVER}.", ''
+        behind = f"tamps are {off} behind this machine's clock"
         if lead_ns >= -_FAR_BEHIND_NS:
-            return '', f"stamps are {off} behind this machine's clock"
-        behind = (
-            f"Stamps are {off} behind this machine's clock; set both by one server, or play a "
-            'recording with a /clock.'
-        )
-        return behind, ''
+            return '', f's{behind}'
+        return f'S{behind}; {_ONE_SERVER}, or play a recording with a /clock.', ''
 
     def _new(self, topic: str, what: str, count: int) -> int:
         """Return the increase of a count since the last call."""
@@ -403,30 +383,29 @@ def fit_item(monitor: Monitor, worker: FitWorker, last_fit_s: float | None) -> I
         'Fit process starts': worker.starts,
         'Notes': '' if curve is None else ' '.join(curve.notes),
     }
+    return Item('fit', *_fit(monitor, worker), values)
+
+
+def _fit(monitor: Monitor, worker: FitWorker) -> tuple[Level, str]:
+    curve, status = monitor.characteristic, monitor.status
     if worker.failures_in_a_row:
         failures = counted(worker.failures_in_a_row, 'failure')
-        sentence = f'{monitor.cause} {failures} in a row.'.strip()
-        return Item('fit', Level.ERROR, sentence, values)
+        return Level.ERROR, f'{monitor.cause} {failures} in a row.'.strip()
     if curve is None:
-        refused = monitor.status == CurveStatus.REFUSED
-        return Item('fit', Level.WARN if refused else Level.OK, monitor.cause, values)
-    if monitor.status == CurveStatus.STALE:
-        return Item('fit', Level.WARN, f'The curve is not renewed: {monitor.cause}', values)
-    if monitor.status == CurveStatus.PROVISIONAL:
-        return Item('fit', Level.WARN, monitor.cause, values)
+        return Level.WARN if status == CurveStatus.REFUSED else Level.OK, monitor.cause
+    if status == CurveStatus.STALE:
+        return Level.WARN, f'The curve is not renewed: {monitor.cause}'
+    if status == CurveStatus.PROVISIONAL:
+        return Level.WARN, monitor.cause
     if curve.source.temperature_flag:
-        return Item(
-            'fit',
-            Level.WARN,
+        return Level.WARN, (
             f'The main steam temperature spread over {curve.source.temperature_spread_k:.1f} K; '
-            'the method assumes a constant one, so the curve may be wrong.',
-            values,
+            'the method assumes a constant one, so the curve may be wrong.'
         )
-    weak = weaknesses(curve)
-    if weak:
+    if weak := weaknesses(curve):
         more = f' Weak points in all: {len(weak)}.' if len(weak) > 1 else ''
-        return Item('fit', Level.WARN, weak[0] + more, values)
-    return Item('fit', Level.OK, f'A curve of {counted(len(curve.pieces), "piece")}.', values)
+        return Level.WARN, weak[0] + more
+    return Level.OK, f'A curve of {counted(len(curve.pieces), "piece")}.'
 
 
 def alarm_item(monitor: Monitor) -> Item:
@@ -439,21 +418,17 @@ def alarm_item(monitor: Monitor) -> Item:
         'Shift (MW)': monitor.judged.shift_mw,
         **_count_values(alarm),
     }
+    level, sentence = Level.OK, 'No alarm.'
     if alarm.active:
-        aside = alarm.state in _ASIDE
-        level = Level.WARN if aside else Level.ERROR
-        return Item('alarm', level, f'The unit does not follow its curve ({words}).', values)
-    if alarm.state == AlarmState.SUPPRESSED:
+        level = Level.WARN if alarm.state in _ASIDE else Level.ERROR
+        sentence = f'The unit does not follow its curve ({words}).'
+    elif alarm.state == AlarmState.SUPPRESSED:
+        level = Level.WARN
         sentence = 'The residual cannot be judged, so no alarm can come (suppressed).'
-        return Item('alarm', Level.WARN, sentence, values)
-    if alarm.standing:
-        return Item(
-            'alarm',
-            Level.WARN,
-            f'The condition has gone; acknowledge the alarm to clear it ({words}).',
-            values,
-        )
-    return Item('alarm', Level.OK, 'No alarm.', values)
+    elif alarm.standing:
+        level = Level.WARN
+        sentence = f'The condition has gone; acknowledge the alarm to clear it ({words}).'
+    return Item('alarm', level, sentence, values)
 
 
 def _words(alarm: Alarm) -> str:
@@ -462,12 +437,15 @@ def _words(alarm: Alarm) -> str:
 
 def _count_values(alarm: Alarm) -> dict[str, object]:
     """Return the values of an alarm that may not have been announced yet."""
-    until_ns = alarm.shelved_until_ns
     return {
         'Occurrences in all runs': alarm.occurrence,
         'Announcements suppressed by alarm_flood': alarm.held,
-        'Shelved until (s since 1970)': None if until_ns is None else until_ns // 10**9,
+        'Shelved until (s since 1970)': _seconds(alarm.shelved_until_ns),
     }
+
+
+def _seconds(time_ns: int | None) -> int | None:
+    return None if time_ns is None else time_ns // 10**9
 
 
 def reference_item(monitor: Monitor) -> Item:
@@ -482,9 +460,7 @@ def reference_item(monitor: Monitor) -> Item:
     shift = reference.shift
     values: dict[str, object] = {
         'Reference': reference.curve.model_id,
-        'Fault since (s since 1970)': (
-            None if reference.fault_ns is None else reference.fault_ns // 10**9
-        ),
+        'Fault since (s since 1970)': _seconds(reference.fault_ns),
         'Wear (MW a month)': None if reference.wear is None else reference.wear.mw_per_month,
         'Alarm': _words(reference.alarm),
         **_count_values(reference.alarm),
@@ -532,12 +508,13 @@ def recorder_item(recording: Recording) -> Item:
         'Files finished': status.files_finished,
         'Bytes written': status.bytes_written,
     }
+    level, sentence = Level.OK, 'Recording.'
     if status.state != RecorderState.RECORDING:
-        return Item('recorder', Level.ERROR, f'Not recording: {status.reason}', values)
-    if dropped or status.lost:
+        level, sentence = Level.ERROR, f'Not recording: {status.reason}'
+    elif dropped or status.lost:
         told = f'{counted(dropped + status.lost, "message is", "messages are")} missing.'
-        return Item('recorder', Level.WARN, f'{told} {status.loss}'.rstrip(), values)
-    return Item('recorder', Level.OK, 'Recording.', values)
+        level, sentence = Level.WARN, f'{told} {status.loss}'.rstrip()
+    return Item('recorder', level, sentence, values)
 
 
 def model_item(monitor: Monitor) -> Item:
@@ -548,13 +525,12 @@ def model_item(monitor: Monitor) -> Item:
         'Its distance from zero (standard errors)': diagnosing.misfit.score,
         'Limit (standard errors)': monitor.settings.real('mismatch_limit'),
     }
+    level, sentence = Level.OK, 'The model fits.'
     if diagnosing.sentence:
-        return Item('model', Level.WARN, diagnosing.sentence, values)
-    if not diagnosing.misfit.name:
-        return Item(
-            'model', Level.OK, 'Not judged yet: this needs a curve and a day of data.', values
-        )
-    return Item('model', Level.OK, 'The model fits.', values)
+        level, sentence = Level.WARN, diagnosing.sentence
+    elif not diagnosing.misfit.name:
+        sentence = 'Not judged yet: this needs a curve and a day of data.'
+    return Item('model', level, sentence, values)
 
 
 def diagnosis_item(monitor: Monitor, worker: DiagnosisWorker, last_s: float | None) -> Item:
@@ -562,7 +538,7 @@ def diagnosis_item(monitor: Monitor, worker: DiagnosisWorker, last_s: float | No
     last = monitor.diagnosing.last
     values: dict[str, object] = {
         'Verdict': 'unknown',
-        'Data until (s since 1970)': None if last is None else last.task.window_end_ns // 10**9,
+        'Data until (s since 1970)': _seconds(last and last.task.window_end_ns),
         'Running': monitor.diagnosing.pending,
         'Running for (s)': worker.busy_s,
         'Last one took (s)': last_s,

@@ -20,12 +20,7 @@ class LogClock:
     """Makes receipt times strictly increasing, so that a log has the order of processing.
 
     If the machine's clock is set back, each message gets the last time plus 1 ns
-    until the clock has caught up.
-
-    Parameters
-    ----------
-    after_ns : int
-        The first time is later than this, in ns.
+    until the clock has caught up. The first time is later than ``after_ns``.
     """
 
     def __init__(self, after_ns: int = 0) -> None:
@@ -225,7 +220,7 @@ class Intake:
     Parameters
     ----------
     sources : mapping of str to MessageSource
-        Sources by contract name of the input.
+        By contract name of the input.
     decoder : Decoder
     log_clock : LogClock
         Shared with other writers of the same log.
@@ -270,16 +265,10 @@ class Intake:
         self.statistics = {name: TopicStatistics() for name in self._sources}
 
     def collect(self, now_s: float, now_ns: int, last: bool = False) -> list[Arrival]:
-        """Return the messages that are due, in their final order.
+        """Return the messages that are due, in their final order; all of them if ``last``.
 
-        Parameters
-        ----------
-        now_s : float
-            Monotonic time.
-        now_ns : int
-            Time of the machine's clock, for messages without a receipt time.
-        last : bool
-            If True, return all messages, including those that would wait.
+        ``now_s`` is monotonic; ``now_ns`` is the machine's clock, for messages without a receipt
+        time.
         """
         until_ns = now_ns - _IN_FLIGHT_NS
         for name, source in self._sources.items():
@@ -297,7 +286,8 @@ class Intake:
                 # The source has more messages, received after the last of these.
                 until_ns = min(until_ns, received_ns)
         if self._clock is not None:
-            self._follow_clock(self._clock)
+            for message in self._clock.take(_MOST_CLOCKS):
+                self._track.note(message.source_ns, header_time_ns(message.data))
             self._release(now_s, last)
         if not self._held:
             return []
@@ -352,18 +342,11 @@ class Intake:
             rows += found
         return rows
 
-    def _follow_clock(self, clock: MessageSource) -> None:
-        for message in clock.take(_MOST_CLOCKS):
-            self._track.note(message.source_ns, header_time_ns(message.data))
-
     def _arrival(self, held: _Held) -> Arrival:
         received_ns, name, message = held.received_ns, held.name, held.message
+        time_ns = received_ns if self._by_receipt else message.source_ns or received_ns
         if self._clock is not None:
             time_ns = self._clock_time(name, message)
-        elif self._by_receipt:
-            time_ns = received_ns
-        else:
-            time_ns = message.source_ns or received_ns
         time_ns = max(0, self._decoder.time_ns(name, message.data, time_ns))
         return Arrival(name, message.data, self._log_clock.stamp(received_ns), time_ns)
 

@@ -36,7 +36,13 @@ from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.ros import declare
 from valveflow_ros.ros.domain import Presence
 from valveflow_ros.ros.encoding import encode
-from valveflow_ros.ros.node.diagnostics import Changes, Item, Level, diagnostics_message
+from valveflow_ros.ros.node.diagnostics import (
+    Changes,
+    Item,
+    Level,
+    diagnostics_message,
+    log_at,
+)
 from valveflow_ros.ros.node.outputs import OUTPUTS, SERVICES
 from valveflow_ros.ros.node.polled_subscription import answer_request
 from valveflow_ros.ros.node.recording import check_record_directory
@@ -91,13 +97,6 @@ class Watchdog:
     Nothing is sent if `NOTIFY_SOCKET` is not set. Pings are sent at twice the rate required by
     `WATCHDOG_USEC`, and only by `completed`, which is called after each complete cycle.
 
-    Parameters
-    ----------
-    environ : mapping, optional
-        Environment variables; by default those of the process.
-    clock : callable
-        Returns monotonic time in s.
-
     Attributes
     ----------
     period_s : float
@@ -142,11 +141,8 @@ class Watchdog:
     def completed(self, recorder: Callable[[], RecorderStatus | None]) -> None:
         """Send a ping, if one is due, after a complete cycle.
 
-        Parameters
-        ----------
-        recorder : callable
-            Returns the status of the recorder, None if there is no recorder. It is called only
-            when a ping is due. No ping is sent while the recorder is stuck.
+        ``recorder`` returns the status of the recorder, None if there is none, and is called only
+        when a ping is due. No ping is sent while the recorder is stuck.
         """
         now_s = self._clock()
         if not self._usec or now_s < self._next_s:
@@ -214,11 +210,7 @@ def _logged(transition: _Transition) -> _Transition:
 class MonitorNode(LifecycleNode):
     """The monitor as a managed node.
 
-    Parameters
-    ----------
-    stop : callable
-        Returns True if the process must end.
-    watchdog : Watchdog, optional
+    ``stop`` returns True if the process must end.
 
     Raises
     ------
@@ -417,13 +409,7 @@ class MonitorNode(LifecycleNode):
         return [Item('name', Level.ERROR, sentence, {'Nodes of this name': self._same_name})]
 
     def _log(self, level: Level, text: str) -> None:
-        # Separate calls: rclpy allows only one severity per line of code.
-        if level == Level.OK:
-            self.get_logger().info(text)
-        elif level == Level.ERROR:
-            self.get_logger().error(text)
-        else:
-            self.get_logger().warning(text)
+        log_at(self.get_logger(), level, text)
 
     # Services
 
@@ -431,8 +417,7 @@ class MonitorNode(LifecycleNode):
         self, name: str, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """Execute a service request."""
-        response.success, response.message = self._done(functools.partial(self._answer, name))
-        return response
+        return self._done(functools.partial(self._answer, name), response)
 
     def _operate(
         self, request: OperateAlarm.Request, response: OperateAlarm.Response
@@ -450,19 +435,23 @@ class MonitorNode(LifecycleNode):
             hours = self.settings.real('alarm_shelve_time') / 3600.0
             return _ONE_ALARM[action].format(request.name, hours)
 
-        response.success, response.message = self._done(answer)
-        return response
+        return self._done(answer, response)
 
-    def _done(self, answer: Callable[[Session], str]) -> tuple[bool, str]:
-        """Execute an action; return success and a sentence that says if it is not on disk yet."""
+    def _done(self, answer: Callable[[Session], str], response: Any) -> Any:
+        """Execute an action; the sentence of the response says if it is not on disk yet."""
         session = self.session
+        response.success, response.message = False, _NOT_RUNNING
         if session is None or not session.listening:
-            return False, _NOT_RUNNING
+            return response
         try:
             sentence = answer(session)
         except ValveflowError as error:
-            return False, str(error)
-        return True, sentence if session.confirm() else f'{sentence} {_NOT_ON_DISK}'
+            response.message = str(error)
+            return response
+        on_disk = session.confirm()
+        response.success = True
+        response.message = sentence if on_disk else f'{sentence} {_NOT_ON_DISK}'
+        return response
 
     def _answer(self, name: str, session: Session) -> str:
         monitor, engine = session.engine.monitor, session.engine

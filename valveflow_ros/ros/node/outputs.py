@@ -39,6 +39,7 @@ from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.ros import encoding
+from valveflow_ros.ros.decoding import type_name
 from valveflow_ros.signals.static_form import OPENING
 from valveflow_ros.signals.units import in_unit
 
@@ -51,25 +52,27 @@ class OutputTopic:
     """A topic under the node's name."""
 
     message_type: type
-    type_name: str
     latched: bool
     kept: int = 1  # messages that a late subscriber gets, if latched
+
+    @property
+    def type_name(self) -> str:
+        """Return the name of the message type, as in a recording."""
+        return type_name(self.message_type)
 
 
 # A frequent alarm must not displace the last message of another active alarm. That one is
 # announced again after `BURIED` announcements, and one or two may come before it.
 _ALARMS_KEPT = BURIED + 2
 OUTPUTS: Mapping[str, OutputTopic] = {
-    'characteristic': OutputTopic(
-        FlowCharacteristic, 'valveflow_msgs/msg/FlowCharacteristic', True
-    ),
-    'breakpoints': OutputTopic(Float64MultiArray, 'std_msgs/msg/Float64MultiArray', True),
-    'slopes': OutputTopic(Float64MultiArray, 'std_msgs/msg/Float64MultiArray', True),
-    'prediction': OutputTopic(Prediction, 'valveflow_msgs/msg/Prediction', False),
-    'segments': OutputTopic(SpecialSegment, 'valveflow_msgs/msg/SpecialSegment', False),
-    'alarms': OutputTopic(Alarm, 'valveflow_msgs/msg/Alarm', True, _ALARMS_KEPT),
-    'diagnosis': OutputTopic(Diagnosis, 'valveflow_msgs/msg/Diagnosis', True),
-    'journal': OutputTopic(JournalEntry, 'valveflow_msgs/msg/JournalEntry', False),
+    'characteristic': OutputTopic(FlowCharacteristic, True),
+    'breakpoints': OutputTopic(Float64MultiArray, True),
+    'slopes': OutputTopic(Float64MultiArray, True),
+    'prediction': OutputTopic(Prediction, False),
+    'segments': OutputTopic(SpecialSegment, False),
+    'alarms': OutputTopic(Alarm, True, _ALARMS_KEPT),
+    'diagnosis': OutputTopic(Diagnosis, True),
+    'journal': OutputTopic(JournalEntry, False),
 }
 
 

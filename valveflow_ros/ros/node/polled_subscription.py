@@ -124,15 +124,8 @@ class PolledSubscription:
         """Return at most ``most`` messages that have arrived, oldest first."""
         if not self._polled:
             return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
-        # Most polls find nothing, so they must be fast.
-        found = self._take_message(self._type, True)
-        if found is None:
-            return []
-        taken = [_raw_message(*found)]
-        while len(taken) < most:
-            found = self._take_message(self._type, True)
-            if found is None:
-                break
+        taken: list[RawMessage] = []
+        while len(taken) < most and (found := self._take_message(self._type, True)) is not None:
             taken.append(_raw_message(*found))
         return taken
 

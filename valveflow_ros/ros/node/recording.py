@@ -55,9 +55,14 @@ def expand_home(name: str) -> Path:
         raise RecordingError(name, 'names the home of a user that is not there') from None
 
 
+def parent_of(settings: Settings) -> Path:
+    """Return the folder with all recordings; raises `RecordingError` as `expand_home`."""
+    return expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
+
+
 def new_folder(settings: Settings, at_s: float) -> Path:
     """Create a new folder for this run; raises `RecordingError` if this fails."""
-    parent = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
+    parent = parent_of(settings)
     stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag_of(settings)}'
     try:
         make_folder(parent)
@@ -84,7 +89,7 @@ def check_record_directory(settings: Settings) -> None:
     """
     if not settings.flag('record'):
         return
-    folder = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
+    folder = parent_of(settings)
     advice = 'set record_directory to a folder this user may write into, or record to false'
     place = folder
     while not place.exists() and place != place.parent:
@@ -118,15 +123,9 @@ class Recording:
         Start time in s since the epoch.
     more : mapping, optional
         Other attachments by name.
-    folder : Path, optional
-        A recording to continue; by default a new one is begun.
-    began : mapping, optional
-        The parameters that the continued recording began with; its journal has the changes.
-
-    Attributes
-    ----------
-    began : dict
-        The parameters that the recording began with.
+    folder, began : Path and mapping, optional
+        A recording to continue, and the parameters that it began with; its journal has the
+        changes. By default a new one is begun.
     """
 
     def __init__(
@@ -152,11 +151,7 @@ class Recording:
             rotate_s=settings.real('record_rotation'),
             keep_files=settings.whole('record_keep') or None,
         )
-        attachments = {
-            PARAMETERS: _json(self.began),
-            TOPICS: _json(topics),
-            **(more or {}),
-        }
+        attachments = {PARAMETERS: _json(self.began), TOPICS: _json(topics), **(more or {})}
         try:
             self.folder = folder or new_folder(settings, at_s)
             self._recorder = Recorder(self.folder, limits, attachments=attachments)
@@ -186,13 +181,8 @@ class Recording:
     ) -> None:
         """Describe a topic; it is added to the file with its first message.
 
-        Parameters
-        ----------
-        topic, type_name : str
-        qos : callable
-            Returns the QoS of each publisher; called with the first message.
-        latched : bool
-            If True, its last message is repeated in later files.
+        ``qos`` returns the QoS of each publisher, and is called with the first message. The last
+        message of a ``latched`` topic is repeated in later files.
         """
         self._offered[topic] = (type_name, qos, latched)
 
@@ -206,7 +196,9 @@ class Recording:
                 self._recorder.add_topic(topic, type_name, qos=qos(), latched=latched)
             self._recorder.record(topic, data, log_ns, time_ns)
         except ValveflowError as error:
-            self._give_up(str(error))
+            # An incomplete recording would be misleading.
+            self.close()
+            self.problem = str(error)
 
     def status(self) -> RecorderStatus | None:
         """Return the recorder's status, None without a recorder."""
@@ -247,11 +239,6 @@ class Recording:
             self.problem = ' '.join(filter(None, said))
         return status
 
-    def _give_up(self, problem: str) -> None:
-        """Stop recording, because an incomplete recording would be misleading."""
-        self.close()
-        self.problem = problem
-
 
 def _json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, indent=2, sort_keys=True).encode()
@@ -260,12 +247,8 @@ def _json(content: Mapping[str, Any]) -> bytes:
 class BackgroundRecovery:
     """Recovers unfinished recordings of this unit once, in a thread, unless they are in use.
 
-    Parameters
-    ----------
-    own : Path
-        The recording of this run.
-    tag : str
-        The unit's part of the folder names; folders of other units are not changed.
+    ``own`` is the recording of this run. ``tag`` is the unit's part of the folder names; folders
+    of other units are not changed.
     """
 
     def __init__(self, own: Path, tag: str) -> None:

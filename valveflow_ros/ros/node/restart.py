@@ -33,16 +33,8 @@ _DOES_NOT_FIT = (ValveflowError, LookupError, TypeError, ValueError, AttributeEr
 class Restart:
     """The earlier run that this one continues, if there is one.
 
-    Parameters
-    ----------
-    settings : Settings
-        Settings of this run.
-    store : StateStore
-        Holds the saved state of the earlier run.
-    inputs, outputs : mapping of str to str
-        Full topic names in this run by contract name.
-    log : callable
-        Called with a level and a sentence.
+    ``inputs`` and ``outputs`` are the full topic names in this run by contract name; ``log`` is
+    called with a level and a sentence.
 
     Attributes
     ----------

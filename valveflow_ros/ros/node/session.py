@@ -47,21 +47,8 @@ _DEPTH = 1000
 class Session:
     """All objects that exist between configure and clean-up.
 
-    Parameters
-    ----------
-    node : Node
-    settings : Settings
-    stop : callable
-        Returns True to stop waiting.
-    log : callable
-        Called with a level and a sentence.
-
-    Attributes
-    ----------
-    engine : LiveEngine
-    recording : Recording
-    inputs, outputs : dict of str to str
-        Full topic names by contract name.
+    ``stop`` returns True to stop waiting; ``log`` is called with a level and a sentence. `inputs`
+    and `outputs` are the full topic names by contract name.
     """
 
     def __init__(
@@ -204,17 +191,16 @@ class Session:
 
     def publish(self, events: Sequence[Event]) -> None:
         """Log, publish and record the events of a call of the engine."""
-        for event in events:
-            line = line_of(event)
-            if line is not None:
-                self._log(*line)
+        for line in filter(None, map(line_of, events)):
+            self._log(*line)
         self._store.note(events)
         outputs = list(self._messages.of(events))
         if not any(isinstance(event, CurveAdopted) for event in events):
             self._send(outputs)
             return
         # A curve is written to disk before it is published, so that it survives a kill.
-        self._record(outputs)
+        for output in outputs:
+            self._record(output)
         if not self.confirm():
             self._log(Level.WARN, 'The new curve is not on disk yet; see recorder and state.')
         for output in outputs:
@@ -341,11 +327,10 @@ class Session:
     def _send(self, outputs: Iterable[Output]) -> None:
         for output in outputs:
             self._publishers[output.name].publish(output.data)
-            self._record([output])
+            self._record(output)
 
-    def _record(self, outputs: Iterable[Output]) -> None:
-        for output in outputs:
-            self.record(self.outputs[output.name], output.data, output.time_ns)
+    def _record(self, output: Output) -> None:
+        self.record(self.outputs[output.name], output.data, output.time_ns)
 
     def _open_recording(self) -> Recording:
         topics: dict[str, Any] = {'inputs': self.inputs, 'outputs': self.outputs}

@@ -29,7 +29,7 @@ from valveflow_ros.monitoring.events import (
 )
 from valveflow_ros.parameters import Depends, Settings, parameter
 from valveflow_ros.ros.node.diagnostics import Item, Level
-from valveflow_ros.ros.node.recording import DEFAULT_FOLDER, expand_home, tag_of
+from valveflow_ros.ros.node.recording import expand_home, parent_of, tag_of
 from valveflow_ros.state import State, from_bytes, perhaps, to_bytes
 
 STATE = 'monitor.state'
@@ -62,12 +62,7 @@ class InUseError(RecordingError):
 
 
 class StateFolder:
-    """A folder that is locked by one monitor as long as it runs.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if absent.
+    """A folder that is locked by one monitor as long as it runs; created if absent.
 
     Raises
     ------
@@ -90,15 +85,7 @@ class StateFolder:
                 stale.unlink()
 
     def keep(self) -> None:
-        """Create folder and lock, also if another program removed them.
-
-        Raises
-        ------
-        InUseError
-            If another monitor keeps its state there.
-        RecordingError
-            If they cannot be created or used.
-        """
+        """Create folder and lock, also if another program removed them; raises as the class."""
         lock = self.folder / LOCK
         try:
             if self._lock >= 0 and _is_named(lock, self._lock):
@@ -128,10 +115,7 @@ class StateFolder:
     def read(self, path: Path | None = None) -> bytes | None:
         """Return the content of a file, by default of the state; None if it does not exist.
 
-        Raises
-        ------
-        RecordingError
-            If it exists but cannot be read.
+        Raises `RecordingError` if it exists but cannot be read.
         """
         path = self.path if path is None else path
         try:
@@ -147,15 +131,8 @@ class StateFolder:
     def set_aside(self, of_use: bool = False) -> bool:
         """Keep the current state under the name `aside`, unless a larger one is already there.
 
-        Parameters
-        ----------
-        of_use : bool
-            If True, the state is copied and stays in use; otherwise it is moved.
-
-        Returns
-        -------
-        bool
-            True if this state was kept.
+        A state ``of_use`` is copied and stays in use; otherwise it is moved. Returns True if it
+        was kept.
         """
         with contextlib.suppress(OSError):
             if not self.aside.exists() or self.aside.lstat().st_size < self.path.lstat().st_size:
@@ -179,15 +156,7 @@ class StateFolder:
                 between.replace(self.aside)
 
     def write(self, data: bytes) -> None:
-        """Replace the state atomically.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        RecordingError
-            As in `keep`.
-        """
+        """Replace the state atomically; raises `OSError`, and `RecordingError` as `keep`."""
         self.keep()
         write_whole(self.path, data)
         self._mark, self._written = mark_of(self.path), True
@@ -235,16 +204,11 @@ def state_folder(settings: Settings) -> Path | None:
         return None
     if given:
         return expand_home(given)
-    parent = expand_home(settings.text('record_directory') or DEFAULT_FOLDER)
-    return parent / f'state_{tag_of(settings)}'
+    return parent_of(settings) / f'state_{tag_of(settings)}'
 
 
 class StateStore:
     """Saves the state in a thread, and finds the state that an earlier run saved.
-
-    Parameters
-    ----------
-    settings : Settings
 
     Attributes
     ----------
@@ -315,14 +279,7 @@ class StateStore:
         return time.monotonic() - self._begun_s >= period_s
 
     def drop(self, reason: str, whole: bool = False) -> None:
-        """Discard the saved state.
-
-        Parameters
-        ----------
-        reason : str
-        whole : bool
-            True if another run can use it.
-        """
+        """Discard the saved state for a reason; a ``whole`` one can be used by another run."""
         self.saved = None
         self.lost = not whole
         stays = self._folder is not None and self._folder.set_aside()
@@ -367,12 +324,8 @@ class StateStore:
     def write(self, state: State, ready: Callable[[], bool]) -> None:
         """Write a state in a thread, after the previous one.
 
-        Parameters
-        ----------
-        state : State
-        ready : callable
-            Returns True when the recording holds everything that is in the state. The state is
-            written then, or after at most `_PATIENCE_S`.
+        ``ready`` returns True when the recording holds everything that is in the state. The state
+        is written then, or after at most `_PATIENCE_S`.
         """
         if self._folder is None:
             return
@@ -390,21 +343,20 @@ class StateStore:
 
     def item(self) -> Item:
         """Return the health item of the saved state."""
-        age = '' if self.saved_s is None else f'{time.monotonic() - self.saved_s:.0f}'
-        values: dict[str, object] = {'Seconds since it was saved': age}
+        level, sentence = Level.OK, 'The state is saved regularly.'
         if self.busy and time.monotonic() - self._started_s > _STUCK_S:
-            stuck = 'The state cannot be saved. Its disk does not answer.'
-            return Item('state', Level.ERROR, stuck, values)
-        if self.problem:
-            return Item('state', Level.ERROR, self.problem, values)
-        if not self.on:
+            level, sentence = Level.ERROR, 'The state cannot be saved. Its disk does not answer.'
+        elif self.problem:
+            level, sentence = Level.ERROR, self.problem
+        elif not self.on:
             nothing = 'Nothing is kept (parameters keep_state, state_directory).'
             return Item('state', Level.OK, nothing)
-        if self.lost:
+        elif self.lost:
             # Shown until the next start, which continues this run; otherwise the loss would not
             # be noticed.
-            return Item('state', Level.WARN, self.sentence, values)
-        return Item('state', Level.OK, 'The state is saved regularly.', values)
+            level, sentence = Level.WARN, self.sentence
+        age = '' if self.saved_s is None else f'{time.monotonic() - self.saved_s:.0f}'
+        return Item('state', level, sentence, {'Seconds since it was saved': age})
 
     def close(self) -> None:
         """Release the folder after the pending save has finished."""

@@ -65,16 +65,9 @@ _ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True, slots=True)
 class WorkerResult:
-    """Result of a request.
+    """Result of a request; a string is the reason why there is none.
 
-    Attributes
-    ----------
-    request_ns : int
-        Identifies the request.
-    result : Characteristic, DiagnosisContent or str
-        A string is the reason why there is no result.
-    seconds : float
-        Duration in s, including communication.
+    ``seconds`` is the duration including communication.
     """
 
     request_ns: int
@@ -127,10 +120,7 @@ def result_to_bytes(result: object) -> bytes:
 def result_from_bytes(data: bytes) -> Characteristic | DiagnosisContent | str | None:
     """Return a result from `result_to_bytes`, None if the job gave none.
 
-    Raises
-    ------
-    DataError
-        If the bytes are no valid result.
+    Raises `DataError` if the bytes are no valid result.
     """
     state = from_bytes(data)
     try:
@@ -224,18 +214,8 @@ class _Running:
 class Worker:
     """Computes one task at a time in a child process.
 
-    Parameters
-    ----------
-    timeout_s : float
-        A task that takes longer is aborted.
-    job : str, optional
-        The function to call, as ``module:function``.
-    clock : callable
-        Returns monotonic time in s.
-
-    Attributes
-    ----------
-    starts, failures_in_a_row : int
+    A task that takes longer than ``timeout_s`` is aborted. ``job`` is the function to call, as
+    ``module:function``; ``clock`` returns monotonic time in s.
     """
 
     word: ClassVar[str]
@@ -287,15 +267,11 @@ class Worker:
         ends: list[Any] = []
         try:
             ours, theirs = ends = list(multiprocessing.Pipe())
-            arguments = (
-                str(os.getpid()),
-                str(theirs.fileno()),
-                self._job,
-                str(self.nice),
-                self.word,
-            )
             process = subprocess.Popen(
-                [sys.executable, '-m', 'valveflow_ros.ros.node.worker', *arguments],
+                [
+                    sys.executable, '-m', 'valveflow_ros.ros.node.worker', str(os.getpid()),
+                    str(theirs.fileno()), self._job, str(self.nice), self.word,
+                ],
                 stdin=subprocess.DEVNULL,
                 # Output of libraries must not appear as output of the monitor.
                 stdout=2,
@@ -303,7 +279,7 @@ class Worker:
                 env={**os.environ, **_ONE_THREAD},
                 # Ctrl-C in a terminal must only reach the monitor.
                 start_new_session=True,
-            )
+            )  # fmt: skip
         except OSError as error:
             for end in ends:
                 end.close()
@@ -511,11 +487,8 @@ def compute(work: Callable[[Any], Any], task: Task, word: str) -> Any:
 def main(arguments: list[str]) -> int:
     """Answer tasks until the parent closes the connection.
 
-    Parameters
-    ----------
-    arguments : list of str
-        The parent's process id, the descriptor of the connection, the job as ``module:function``,
-        the nice value, and the name of the job for messages.
+    The arguments are the parent's process id, the descriptor of the connection, the job as
+    ``module:function``, the nice value, and the name of the job for messages.
     """
     parent, descriptor, job, nice, word = arguments
     # The kernel ends this process when its parent ends for any reason.
