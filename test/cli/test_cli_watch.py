@@ -73,8 +73,8 @@ def test_without_ros_it_says_so_and_what_else_there_is(run, monkeypatch):
      ['--interval', '1.0', '--ask', 'shelve_alarms', '--alarm', 'residual',
       '--time-zone=-05:00']),
     (['--page', '--node', '/a/b', '--webhook', 'http://a/', '--name', 'plant'], 'page_main',
-     ['--host', '127.0.0.1', '--port', '8350', '--time-zone=', '--name', 'plant',
-      '--node', '/a/b', '--webhook', 'http://a/']),
+     ['--host', '127.0.0.1', '--port', '8350', '--name', 'plant', '--node', '/a/b',
+      '--webhook', 'http://a/', '--time-zone=']),
 ])  # fmt: skip
 def test_with_ros_another_process_takes_over(run, monkeypatch, words, module, handed_on):
     def become(path, given):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,16 +17,16 @@ from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.fit.result import wrong_form
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import Result
+from valveflow_ros.interface.files import Result, as_text
 from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import (
     Model,
     check_output,
-    load_characteristic,
     load_model,
     load_truth,
     model_path,
-    with_exponent,
+    taken_curve,
+    taken_model,
 )
 from valveflow_ros.interface.observation import Observed, cut_in_two, observe_log, settings_of
 from valveflow_ros.parameters import PARAMETERS, Settings
@@ -82,7 +81,7 @@ class ComparisonResult(Result):
             'words': [data_words(data), *finding_words(data)],
         }
         return {
-            'comparison.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
+            'comparison.json': as_text(content, 1),
             'parameters.csv': parameters_csv(data),
             'segments.csv': segments_csv(data.result.judgement, data.predictions),
             'curves.csv': curves_csv(data),
@@ -124,7 +123,7 @@ class ValidationResult(Result):
         }
         predictions = tuple(data.result.predictions)
         return {
-            'validation.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
+            'validation.json': as_text(content, 1),
             'segments.csv': segments_csv(data.result.judgement, predictions),
         }
 
@@ -219,11 +218,16 @@ def validate(
     RecordingError, InputError, DataError
         The log cannot be read or contains no data for the test.
     """
-    curve, second, given = check_models(model, against, parameters or {})
+    curve, given = taken_model(model, parameters, load_model)
+    assert curve is not None
+    second = taken_curve(against)
+    if second is not None and isinstance(curve, ExtendedModel):
+        raise UsageError(
+            '--against takes two curves over the same rows, and those of an extended model are '
+            'freed of its causes: validate each by itself and compare their errors.'
+        )
     log = _not_empty(as_log(log, progress))
-    for one, called in ((curve, 'The model'), (second, 'The second curve')):
-        if one is not None:
-            check_output(one, log.output_unit, called)
+    check_output(log.output_unit, model=curve, second_curve=second)
     extended = None
     if isinstance(curve, ExtendedModel):
         extended, curve = curve, curve.characteristic()
@@ -247,35 +251,6 @@ def validate(
         progress.warn(held)
     names = _name(model, against), '' if against is None else _name(against, model)
     return ValidationResult(Validated(log.name, *names, result, contents, notes, held))
-
-
-def check_models(
-    model: Model | str | Path, against: Characteristic | str | Path | None,
-    parameters: Mapping[str, Any],
-) -> tuple[Model, Characteristic | None, dict[str, Any]]:  # fmt: skip
-    """Read the curves of a validation and check that they can be used together.
-
-    The returned parameters contain the pressure exponent of the model.
-
-    Raises
-    ------
-    RecordingError
-        A file cannot be read.
-    UsageError
-        ``against`` is given with an extended model, which is tested on rows after removing
-        its causes; or the parameters give another pressure exponent.
-    """
-    first = model if isinstance(model, Characteristic | ExtendedModel) else load_model(model)
-    second = against
-    if second is not None and not isinstance(second, Characteristic):
-        second = load_characteristic(second)
-    if second is not None and isinstance(first, ExtendedModel):
-        raise UsageError(
-            '--against takes two curves over the same rows, and those of an extended model are '
-            'freed of its causes: validate each by itself and compare their errors.'
-        )
-    name = 'The model' if first is model else model
-    return first, second, with_exponent(first, parameters, name)
 
 
 def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:

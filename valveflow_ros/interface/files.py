@@ -154,6 +154,11 @@ def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict
     return found
 
 
+def as_text(content: Mapping[str, Any], indent: int = 2) -> str:
+    """Return the text of a JSON file."""
+    return json.dumps(content, indent=indent, allow_nan=False) + '\n'
+
+
 def is_empty(path: Path) -> bool:
     """Return True if the file exists and contains nothing that could be lost."""
     return path.is_file() and path.stat().st_size == 0

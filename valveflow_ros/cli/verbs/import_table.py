@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.mapping import LogMapping
     from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
-_DESCRIPTION = """\
+USAGE = 'TABLE -o LOG.mcap [options]'
+DESCRIPTION = """\
 Read a table exported from a historian (CSV, Excel or Parquet; one column for each signal, or one
 row for each value) and write it as an MCAP recording that valveflow, ros2 bag, Foxglove and
 PlotJuggler read. It recognises columns, units, dates and decimal marks, and shows what it
@@ -59,9 +60,7 @@ _CHOICES = ('time-zone', 'date-order', 'decimal', 'sheet')
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow import TABLE -o LOG.mcap [options]'
+    """Add the options."""
     parser.add_argument(
         'table', metavar='TABLE', type=_source,
         help='a .csv, .xlsx or .parquet file, or opcua://host:port',
