@@ -229,6 +229,12 @@ def selected(readings: Readings, rows: BoolArray | IntArray) -> Readings:
     )  # fmt: skip
 
 
+def joined(parts: Iterable[Readings]) -> Readings:
+    """Return readings one part behind the other."""
+    columns = zip(*((r.time_ns, r.signal, r.value, r.quality) for r in parts), strict=True)
+    return Readings(*map(np.concatenate, columns))
+
+
 def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
     """Add each constant at every reading of a measured signal; `DataError` if none is measured."""
     if not constants:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import (
     TABLES,
+    as_text,
     check_log,
     check_writable,
     is_empty,
@@ -138,7 +138,7 @@ class Simulation:
         written = self._write_log(path, overwrite)
         if truth is not None:
             with whole_file(Path(truth)) as draft:
-                draft.write_text(json.dumps(self.to_json(), indent=2) + '\n', encoding='utf-8')
+                draft.write_text(as_text(self.to_json()), encoding='utf-8')
         return written
 
     def _write_log(self, path: Path, overwrite: bool) -> Path:
@@ -203,7 +203,14 @@ def simulate(
     if not isinstance(recording, Historian):
         recording = Historian.parse(recording)
     if unit != PAPER:
-        return _thermal(days, seed, effects, unit, recording, start_ns, progress)
+        if not isinstance(unit, ThermalUnit):
+            if unit.partition(':')[0].strip() not in KINDS:
+                known = ', '.join((PAPER, *KINDS))
+                raise InputError(f"There is no unit '{unit}': use one of {known}.")
+            unit = unit_of(unit)
+        data = simulate_thermal(days, seed, unit, recording, start_ns, effects)
+        progress(0.6, 'simulating')
+        return Simulation(data, days, seed)
     if recording != Historian():
         raise InputError(
             "The paper's unit is recorded once a second only. Choose another unit for the "
@@ -216,23 +223,3 @@ def simulate(
         parts.append(part)
         progress(min(0.6, 0.6 * len(parts) / days), 'simulating')
     return Simulation(SimulatedLog.joined(parts), days, seed)
-
-
-def _thermal(
-    days: float,
-    seed: int,
-    effects: Sequence[str | EffectSpec],
-    unit: str | ThermalUnit,
-    recording: Historian,
-    start_ns: int,
-    progress: Progress,
-) -> Simulation:
-    """Simulate a unit that is not the paper's."""
-    if not isinstance(unit, ThermalUnit):
-        if unit.partition(':')[0].strip() not in KINDS:
-            known = ', '.join((PAPER, *KINDS))
-            raise InputError(f"There is no unit '{unit}': use one of {known}.")
-        unit = unit_of(unit)
-    data = simulate_thermal(days, seed, unit, recording, start_ns, effects)
-    progress(0.6, 'simulating')
-    return Simulation(data, days, seed)
