@@ -228,16 +228,6 @@ def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
         assert piece['slope'] == pytest.approx(slope, rel=0.05)
 
 
-def test_readings_that_were_not_used_are_told(run, logs, tmp_path):
-    odd = range(5000, 5010)
-    rewritten(
-        logs / 'plant.csv', tmp_path / 'x.csv', 'generated_power_mw',
-        lambda k, mw: '99999' if k in odd else mw,
-    )  # fmt: skip
-    ran = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out', *QUICK)
-    assert 'generated_power: 10 impossible value' in ran.out
-
-
 def test_a_curve_that_explains_little_is_not_to_be_relied_on(run, logs, tmp_path):
     """The power is that of another time."""
     power = open_log(logs / 'plant.csv').readings.by_signal()[Signal.GENERATED_POWER].value
@@ -336,12 +326,6 @@ def test_the_way_to_a_step_test_is_told(run, levels_log, tmp_path):
     refused = ran.refused()
     assert '--step-test identifies it' in refused
     assert 'for data of a closed loop do not use it' in refused
-
-
-def test_ordinary_operation_is_no_step_test(run, logs, tmp_path):
-    said = run('identify', logs / 'plant.mcap', '-o', tmp_path / 'out', '--step-test').refused()
-    assert 'This is no step test' in said
-    assert not (tmp_path / 'out').exists()
 
 
 CONSTANTS = ['--constant', 'main_steam_pressure=1', '--constant', 'main_steam_temperature=540']

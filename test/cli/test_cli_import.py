@@ -168,22 +168,6 @@ def test_the_output_is_checked_before_the_work(run, history):
     assert history.read_bytes() == before
 
 
-def test_columns_that_are_not_used_are_named_for_parquet_and_semicolons_too(run, tmp_path):
-    import pandas as pd
-
-    names = [i.column for i in SIGNALS if i.required]
-    frame = pd.DataFrame({'time': 1700000000 + np.arange(5), 'A;B': 1.0, 'Note': 'x'})
-    for name, value in zip(names, (50.0, 12.0, 540.0, 200.0), strict=True):
-        frame[name] = value
-    frame.to_parquet(tmp_path / 'h.parquet')
-    frame.drop(columns='A;B').to_csv(tmp_path / 'h.csv', sep=';', decimal=',', index=False)
-    ran = run('import', tmp_path / 'h.parquet', '-o', tmp_path / 'a.mcap', '--json')
-    assert ran.json['ignored'] == ['A;B', 'Note']
-    ran = run('import', tmp_path / 'h.csv', '-o', tmp_path / 'b.mcap', '--json')
-    assert ran.json['ignored'] == ['Note']
-    assert ran.json['signals'][1]['high'] == 12.0
-
-
 def test_a_column_that_gives_way_to_a_constant_is_not_used(run, tmp_path, write_csv):
     header = 'time,' + ','.join(i.column for i in SIGNALS if i.required)
     table = write_csv(header, [f'{1700000000 + k},50,12,540,200' for k in range(5)])

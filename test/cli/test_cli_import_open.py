@@ -10,21 +10,17 @@ import shlex
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from logged import values
 from streams import flow_valve
 
 import valveflow_ros as vf
 from valveflow_ros.cli.command import Console, TableOption
-from valveflow_ros.cli.main import Parser, parser_of
-from valveflow_ros.cli.verbs import import_table
+from valveflow_ros.cli.main import parser_of
 from valveflow_ros.errors import InputError, UsageError
 from valveflow_ros.interface.mapping import LOOKING_ON
 from valveflow_ros.logs import open_log
-from valveflow_ros.logs.tables.refusal import Remedy
 from valveflow_ros.records import Signal
-from valveflow_ros.signals.units import AIR_MPA, convert
+from valveflow_ros.signals.units import convert
 
 HEAD = 'Date,Valve position,Steam press,Steam temp,Gross MW'
 
@@ -96,16 +92,6 @@ def test_what_only_the_person_knows_is_left_to_be_filled_in(run, table, tmp_path
     assert run(*filled).status == 0
 
 
-def test_two_columns_and_their_unit_are_one_option(run, table, tmp_path):
-    text = table.read_text().splitlines()
-    text = [text[0] + ',Net MW', *(f'{line},190000' for line in text[1:])]
-    table.write_text('\n'.join(text))
-    said = run('import', table, '-o', tmp_path / 'x.mcap').refused()
-    assert 'with the first of each choice' in said
-    assert sum('generated_power' in word for word in last_command(said)) == 1
-    assert run(*last_command(said)).status == 0
-
-
 def test_a_suggested_command_holds_with_values_that_begin_with_a_dash(
     run, table, tmp_path, monkeypatch
 ):
@@ -121,18 +107,6 @@ def test_a_suggested_command_holds_with_values_that_begin_with_a_dash(
     readings = open_log(tmp_path / '-x.mcap').readings
     first = np.datetime64('2026-02-01T05:00:00', 'ns').astype(np.int64)
     assert readings.time_ns.min() == first
-
-
-@pytest.mark.parametrize(('option', 'value'), [
-    ('sheet', '-Data'), ('sheet', "- it's"), ('time-zone', '-05:00'), ('date-order', 'dmy'),
-    ('column', 'generated_power=-MW:kW'),
-])  # fmt: skip
-def test_an_option_that_is_suggested_is_read_back(option, value):
-    parser = Parser('valveflow import')
-    import_table.arguments(parser)
-    words = shlex.split(str(Remedy(option, value)))
-    (said,) = parser.parse_args(['x.csv', *words]).column
-    assert said == (value if option == 'column' else TableOption(option, value))
 
 
 @pytest.mark.parametrize('verb', ['import', 'info'])
@@ -178,15 +152,6 @@ def test_a_gauge_pressure_can_be_said(run, table, tmp_path, header, spelt, unit)
     if unit in ('bar', 'barg'):  # a monitor is told so too
         ran = run('config', 'init', table, *SAID, pressure)
         assert f"main_steam_pressure_unit: '{unit}'" in ran.out
-
-
-@settings(max_examples=50)
-@given(st.floats(0.0, 300.0), st.sampled_from(['barg', 'MPag', 'kPag', 'psig']))
-def test_gauge_is_absolute_less_the_air(value, unit):
-    signal = Signal.MAIN_STEAM_PRESSURE
-    gauge = convert(signal, unit, np.array([value]))[0]
-    absolute = convert(signal, unit[:-1], np.array([value]))[0]
-    assert gauge - absolute == pytest.approx(AIR_MPA)
 
 
 ROWS = np.arange(60)
@@ -256,13 +221,6 @@ def test_a_table_without_times_has_a_period(run, tmp_path, frame, said):
     assert vf.open_log(path, period=said).span_s == 60.0 * (len(ROWS) - 1)
 
 
-def test_blocks_of_a_table_without_times_follow_each_other(tmp_path, frame):
-    many = pd.concat([frame] * 4000, ignore_index=True)
-    many.to_parquet(tmp_path / 'a.parquet', row_group_size=100_000)
-    log = vf.open_log(tmp_path / 'a.parquet', period='1s')
-    assert log.span_s == len(many) - 1
-
-
 @pytest.mark.parametrize('said', ['soon', '0', '-5s', 'nan', '2d', '1e9', ''])
 def test_a_period_that_is_none_is_refused(run, tmp_path, frame, said):
     frame.to_csv(tmp_path / 'a.csv', index=False)
@@ -293,25 +251,6 @@ def test_a_log_without_a_possible_pressure_is_refused(run, tmp_path, frame, pres
     with pytest.raises(InputError, match='impossible'):
         vf.open_log(path)
     assert not (tmp_path / 'x.mcap').exists()
-
-
-@pytest.mark.parametrize(('unit', 'scale', 'zero'), [('degF', 1.8, 32.0), ('K', 1.0, 273.15)])
-def test_a_temperature_in_another_unit_is_refused(run, tmp_path, frame, unit, scale, zero):
-    path = tmp_path / 'a.csv'
-    theirs = scale * frame['main_steam_temperature_degc'] + zero
-    theirs.iloc[:2] = 60.0
-    frame.assign(main_steam_temperature_degc=theirs).to_csv(path, index_label='time')
-    said = run('import', path, '-o', tmp_path / 'x.mcap').refused()
-    assert f'main_steam_temperature=main_steam_temperature_degc:{unit}' in said
-    assert run(*shlex.split(said.splitlines()[-1])[1:]).status == 0
-
-
-def test_a_log_with_some_possible_pressures_is_read_with_a_warning(run, tmp_path, frame):
-    some = np.where(ROWS < 30, 0.0, 15.0)
-    frame.assign(main_steam_pressure_mpa=some).to_csv(tmp_path / 'a.csv', index_label='time')
-    ran = run('import', tmp_path / 'a.csv', '--dry-run')
-    assert ran.status == 0
-    assert 'impossible' in ran.err
 
 
 @pytest.mark.parametrize('said', [[], ['--column', 'main_steam_pressure=Pressure [kPa]']])

@@ -95,24 +95,6 @@ def test_a_signal_in_one_part_of_a_verb(
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
-def test_what_a_library_has_half_made_is_cleared_away_without_a_word():
-    code = (
-        'import os, signal, sys\n'
-        'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-        'from valveflow_ros.cli import main\n'
-        'class Half:\n'
-        '    def __del__(self):\n'
-        '        self.close()\n'
-        'half = Half()\n'
-        'main.load = lambda name: os.kill(os.getpid(), signal.SIGINT)\n'
-        'sys.exit(main.main(["info", "x.mcap"]))'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (130, SAID)
-
-
 def test_ctrl_c_while_the_interpreter_ends_changes_nothing():
     code = (
         'import atexit, os, signal, sys\n'
