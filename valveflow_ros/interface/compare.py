@@ -16,34 +16,18 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.fit.result import wrong_form
-from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface import SILENT, Progress, models
 from valveflow_ros.interface.files import Result, as_text
 from valveflow_ros.interface.logs import Log, as_log
-from valveflow_ros.interface.models import (
-    Model,
-    check_output,
-    load_model,
-    load_truth,
-    model_path,
-    taken_curve,
-    taken_model,
-)
+from valveflow_ros.interface.models import Model
 from valveflow_ros.interface.observation import Observed, cut_in_two, observe_log, settings_of
 from valveflow_ros.parameters import PARAMETERS, Settings
+from valveflow_ros.report import comparison_tables
+from valveflow_ros.report import validation as validation_report
 from valveflow_ros.report.comparison import comparison_page, data_words, finding_words
-from valveflow_ros.report.comparison_tables import (
-    Compared,
-    curves_csv,
-    parameters_csv,
-    segments_csv,
-)
+from valveflow_ros.report.comparison_tables import Compared
 from valveflow_ros.report.page import Page
-from valveflow_ros.report.validation import (
-    OUTSIDE_FLAG,
-    Validated,
-    validation_page,
-    verdict_words,
-)
+from valveflow_ros.report.validation import Validated
 from valveflow_ros.report.words import held_words, percent
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 
@@ -82,9 +66,11 @@ class ComparisonResult(Result):
         }
         return {
             'comparison.json': as_text(content, 1),
-            'parameters.csv': parameters_csv(data),
-            'segments.csv': segments_csv(data.result.judgement, data.predictions),
-            'curves.csv': curves_csv(data),
+            'parameters.csv': comparison_tables.parameters_csv(data),
+            'segments.csv': comparison_tables.segments_csv(
+                data.result.judgement, data.predictions
+            ),
+            'curves.csv': comparison_tables.curves_csv(data),
         }
 
 
@@ -107,7 +93,7 @@ class ValidationResult(Result):
 
     def page(self) -> Page:
         """Return the report."""
-        return validation_page(self.data)
+        return validation_report.validation_page(self.data)
 
     def texts(self) -> dict[str, str]:
         """Return ``validation.json`` and ``segments.csv``."""
@@ -119,12 +105,12 @@ class ValidationResult(Result):
             'model': data.model,
             'against': data.other or None,
             'held': [h.name for h in data.result.characteristic.held],
-            'words': verdict_words(data),
+            'words': validation_report.verdict_words(data),
         }
         predictions = tuple(data.result.predictions)
         return {
             'validation.json': as_text(content, 1),
-            'segments.csv': segments_csv(data.result.judgement, predictions),
+            'segments.csv': comparison_tables.segments_csv(data.result.judgement, predictions),
         }
 
 
@@ -158,7 +144,7 @@ def compare(
     # The other two methods are used as in the paper: their input is V p^m.
     given = {**(parameters or {}), 'axis': INTEGRATED_INPUT}
     if truth is not None and not isinstance(truth, Truth):
-        truth = load_truth(truth)
+        truth = models.load_truth(truth)
     log = _not_empty(as_log(log, progress))
     if test is None:
         block = given.get('block', PARAMETERS['block'].default)
@@ -218,16 +204,16 @@ def validate(
     RecordingError, InputError, DataError
         The log cannot be read or contains no data for the test.
     """
-    curve, given = taken_model(model, parameters, load_model)
+    curve, given = models.taken_model(model, parameters, models.load_model)
     assert curve is not None
-    second = taken_curve(against)
+    second = models.taken_curve(against)
     if second is not None and isinstance(curve, ExtendedModel):
         raise UsageError(
             '--against takes two curves over the same rows, and those of an extended model are '
             'freed of its causes: validate each by itself and compare their errors.'
         )
     log = _not_empty(as_log(log, progress))
-    check_output(log.output_unit, model=curve, second_curve=second)
+    models.check_output(log.output_unit, model=curve, second_curve=second)
     extended = None
     if isinstance(curve, ExtendedModel):
         extended, curve = curve, curve.characteristic()
@@ -236,7 +222,7 @@ def validate(
     progress(0.7, 'judging')
     tolerance = tolerance_mw or settings.real('alarm_floor')
     result = validation.validate(curve, other_data(contents, settings), tolerance, second)
-    if result.outside_share > OUTSIDE_FLAG:
+    if result.outside_share > validation_report.OUTSIDE_FLAG:
         progress.warn(
             f'{percent(result.outside_share, 2)} of the special samples lie beyond the ends of '
             'the curve and were not judged.'
@@ -257,8 +243,8 @@ def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
     """Return a file's name, with its folder if a folder was given or two names would be equal."""
     if isinstance(model, Characteristic | ExtendedModel):
         return getattr(model, 'model_id', '') or 'the model'
-    file = model_path(Path(model))
-    alike = isinstance(other, str | Path) and model_path(Path(other)).name == file.name
+    file = models.model_path(Path(model))
+    alike = isinstance(other, str | Path) and models.model_path(Path(other)).name == file.name
     return str(file) if alike or file != Path(model) else file.name
 
 

@@ -13,19 +13,9 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.errors import DataError, InputError
-from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface import SILENT, Progress, plausibility
 from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, gather_refusals, read_mapping
-from valveflow_ros.interface.plausibility import (
-    Doubt,
-    air_note,
-    check_constants,
-    doubt,
-    limits_beside_steam,
-    refuse_guesses,
-    refuse_impossible,
-    selected,
-    with_constants,
-)
+from valveflow_ros.interface.plausibility import Doubt
 from valveflow_ros.logs import LogContents
 from valveflow_ros.logs import open_log as read_file
 from valveflow_ros.logs.names import signal_of
@@ -132,7 +122,7 @@ class Log:
         def cut(readings: Readings) -> Readings:
             times, ends = readings.time_ns, np.iinfo(np.int64)
             first = ends.min if start_ns is None else start_ns
-            return selected(
+            return plausibility.selected(
                 readings, (times >= first) & (times <= (ends.max if end_ns is None else end_ns))
             )
 
@@ -158,7 +148,7 @@ class Log:
         InputError
             The given parameters name another unit of the flow.
         """
-        found: dict[str, Any] = {**limits_beside_steam(self.units, self.constants)}
+        found: dict[str, Any] = {**plausibility.limits_beside_steam(self.units, self.constants)}
         told: list[str] = []
         unit = self.output_unit
         wanted = given.get('generated_power_unit', unit)
@@ -449,20 +439,21 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
     stated = {**units, **mapping.constant_units}
     output = engine_unit(Signal.GENERATED_POWER, stated.get(Signal.GENERATED_POWER, ''))
     progress.measured_in(output)
-    settings = Settings(limits_beside_steam(stated, constants))
-    check_constants(constants, settings)
+    settings = Settings(plausibility.limits_beside_steam(stated, constants))
+    plausibility.check_constants(constants, settings)
     measured_signals = sorted(units.keys() - constants.keys())
     for signal in measured_signals:
-        if note := air_note(signal, units[signal], contents.signals[signal]):
+        if note := plausibility.air_note(signal, units[signal], contents.signals[signal]):
             progress.say(note)
     raw, steam = contents.readings, output == 'MW'
     judged = (
-        doubt(s, raw.value[raw.signal == s], units[s], settings, steam) for s in measured_signals
+        plausibility.doubt(s, raw.value[raw.signal == s], units[s], settings, steam)
+        for s in measured_signals
     )
     doubts = [found for found in judged if found is not None]
-    refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
+    plausibility.refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
     if not contents.topics:  # a table
-        refuse_impossible(contents.path, doubts, contents.signals)
+        plausibility.refuse_impossible(contents.path, doubts, contents.signals)
     for found in doubts:
         progress.warn(found.advice(contents.signals[found.signal]))
     for signal in constants.keys() & contents.signals.keys():
@@ -475,10 +466,12 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
     if compression is not None:
         progress.say(compression.sentence)
     if compression is None or not compression.own_times:
-        readings = with_constants(measured, constants)
+        readings = plausibility.with_constants(measured, constants)
         return Log(name, contents, readings, stated, constants, doubts, compression)
-    held = with_constants(held_readings(measured, compression), constants)
-    recorded = with_constants(selected(measured, np.isfinite(measured.value)), constants)
+    held = plausibility.with_constants(held_readings(measured, compression), constants)
+    recorded = plausibility.with_constants(
+        plausibility.selected(measured, np.isfinite(measured.value)), constants
+    )
     return Log(name, contents, held, stated, constants, doubts, compression, recorded)
 
 

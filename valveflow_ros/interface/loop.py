@@ -15,17 +15,8 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import as_text, write_texts
 from valveflow_ros.interface.logs import nanoseconds
-from valveflow_ros.logs.tables.loop_columns import (
-    COMMAND,
-    POSITION,
-    PROCESS,
-    ROLES,
-    SET_POINT,
-    LoopColumns,
-    ordered,
-    read_loop_columns,
-    roles_of,
-)
+from valveflow_ros.logs.tables import loop_columns
+from valveflow_ros.logs.tables.loop_columns import COMMAND, POSITION, PROCESS, SET_POINT
 from valveflow_ros.logs.tables.refusal import TableOptions
 from valveflow_ros.logs.tables.times import NEVER
 from valveflow_ros.records import FloatArray
@@ -149,7 +140,9 @@ def judge_loop(
     if hasattr(table, 'columns'):
         read = _from_dataframe(table, named, time)
     else:
-        read = read_loop_columns(Path(table), {**named, 'time': time}, options or TableOptions())
+        read = loop_columns.read_loop_columns(
+            Path(table), {**named, 'time': time}, options or TableOptions()
+        )
     step_s, values = _gridded(read)
     progress(0.3, 'judging')
     used = (COMMAND, POSITION) if POSITION in values else (COMMAND, PROCESS, SET_POINT)
@@ -166,7 +159,7 @@ def _known(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
-def _gridded(read: LoopColumns) -> tuple[float, dict[str, FloatArray]]:
+def _gridded(read: loop_columns.LoopColumns) -> tuple[float, dict[str, FloatArray]]:
     """Return the median step in s and the columns on a grid of that step, NaN in missing rows."""
     times = read.time_ns
     if len(times) < 2:
@@ -184,15 +177,15 @@ def _gridded(read: LoopColumns) -> tuple[float, dict[str, FloatArray]]:
     return step / 1e9, out
 
 
-def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> LoopColumns:
+def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> loop_columns.LoopColumns:
     import pandas as pd
 
     names = [str(c) for c in frame.columns]
     if absent := [c for c in (*named.values(), time) if c and c not in names]:
         raise InputError(f"The DataFrame has no column '{absent[0]}'.")
-    guessed = roles_of(names, [''] * len(names))
+    guessed = loop_columns.roles_of(names, [''] * len(names))
     chosen = {role: theirs for role, theirs in named.items() if theirs}
-    for role in ROLES:
+    for role in loop_columns.ROLES:
         behind = role in (POSITION, PROCESS) and {POSITION, PROCESS} & set(chosen)
         free = [names[k] for k in guessed.get(role, []) if names[k] not in chosen.values()]
         if role not in chosen and not behind and len(free) == 1:
@@ -211,4 +204,4 @@ def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> LoopColumns
         role: pd.to_numeric(frame[theirs], errors='coerce').to_numpy(np.float64)
         for role, theirs in chosen.items()
     }
-    return ordered(np.where(there, time_ns, NEVER), values, chosen)
+    return loop_columns.ordered(np.where(there, time_ns, NEVER), values, chosen)

@@ -12,16 +12,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import (
-    TABLES,
-    as_text,
-    check_log,
-    check_writable,
-    is_empty,
-    whole_file,
-    write_log,
-)
+from valveflow_ros.interface import SILENT, Progress, files
 from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.plant.historian import Historian
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, SimulatedLog, simulate_parts
@@ -132,30 +123,30 @@ class Simulation:
             It cannot be written, or exists already.
         """
         path = Path(path)
-        check_log(path, overwrite=overwrite)
+        files.check_log(path, overwrite=overwrite)
         if truth is not None:
-            check_writable(Path(truth))
+            files.check_writable(Path(truth))
         written = self._write_log(path, overwrite)
         if truth is not None:
-            with whole_file(Path(truth)) as draft:
-                draft.write_text(as_text(self.to_json()), encoding='utf-8')
+            with files.whole_file(Path(truth)) as draft:
+                draft.write_text(files.as_text(self.to_json()), encoding='utf-8')
         return written
 
     def _write_log(self, path: Path, overwrite: bool) -> Path:
         from valveflow_ros.logs import write_table
         from valveflow_ros.logs.mcap.importing import write_readings
 
-        if path.suffix.lower() in TABLES:
-            with whole_file(path) as draft:
+        if path.suffix.lower() in files.TABLES:
+            with files.whole_file(path) as draft:
                 write_table(self.data.table, draft, self._extra())
             return path
         if isinstance(self.data, ThermalLog) and self.data.historian.own_times:
             # A recording in rows would contain values that were never sent.
             return write_readings(
                 [self.data.readings], [info.signal for info in SIGNALS], path,
-                overwrite=overwrite or is_empty(path),
+                overwrite=overwrite or files.is_empty(path),
             ).path  # fmt: skip
-        return write_log(self.data.table, path, overwrite)
+        return files.write_log(self.data.table, path, overwrite)
 
 
 def simulate(

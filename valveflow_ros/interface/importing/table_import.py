@@ -18,21 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.interface import Progress
+from valveflow_ros.interface import Progress, plausibility
 from valveflow_ros.interface.files import reason
 from valveflow_ros.interface.logs import Series, read_series
 from valveflow_ros.interface.mapping import LogMapping, merge_refusals
-from valveflow_ros.interface.plausibility import (
-    air_note,
-    check_constants,
-    doubt,
-    joined,
-    limits_beside_steam,
-    refuse_guesses,
-    refuse_impossible,
-    selected,
-    with_constants,
-)
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.reader import RawBlock, TableReader
 from valveflow_ros.logs.tables.refusal import RefusedError
@@ -206,8 +195,8 @@ class TableImport:
         self._units = {name: mapping.unit_of(_SIGNALS[name], told) for name in names}
         measured = {_SIGNALS[name]: unit for name, unit in self._units.items()}
         self._stated = {**measured, **mapping.constant_units}
-        self._limits = Settings(limits_beside_steam(self._stated, self._constants))
-        check_constants(self._constants, self._limits)
+        self._limits = Settings(plausibility.limits_beside_steam(self._stated, self._constants))
+        plausibility.check_constants(self._constants, self._limits)
         self._output = engine_unit(
             Signal.GENERATED_POWER, self._stated.get(Signal.GENERATED_POWER, '')
         )
@@ -269,7 +258,9 @@ class TableImport:
         notes = [note for note in notes if note]
         for note in notes:
             self._progress.say(note)
-        airs = (air_note(_SIGNALS[n], self._units[n], reader.names[n]) for n in self._used)
+        airs = (
+            plausibility.air_note(_SIGNALS[n], self._units[n], reader.names[n]) for n in self._used
+        )
         notes += filter(None, airs)  # the result says them
         if all(np.isnan(found.low) for found in self._statistics.values()):
             raise DataError(f'{reader.path}: there is no number in any of the columns used.')
@@ -311,7 +302,7 @@ class TableImport:
             readings = Readings(
                 time_ns[row], signal, table.values[row, signal], table.quality[row, signal]
             )
-            yield with_constants(readings, self._constants)
+            yield plausibility.with_constants(readings, self._constants)
 
     def sources(self) -> list[SignalSource]:
         """Return the source of each signal, in the order of `Signal`."""
@@ -333,7 +324,7 @@ class TableImport:
                         info.topic, theirs, written, unit, float(low), float(high),
                         found.missing, False, dict(reader.words[name].most_common(8)),
                         reader.empty[name], reader.grounds.get(name, ''),
-                        air_note(info.signal, written, theirs),
+                        plausibility.air_note(info.signal, written, theirs),
                     )
                 )  # fmt: skip
         return sources
@@ -439,7 +430,7 @@ class TableImport:
         """Raise `RefusedError` for wrong guesses, and warn of other implausible columns."""
         settings, reader, steam = self._limits, self._reader, self._output == 'MW'
         judged = (
-            doubt(_SIGNALS[name], found.sample(), self._units[name], settings, steam)
+            plausibility.doubt(_SIGNALS[name], found.sample(), self._units[name], settings, steam)
             for name, found in self._statistics.items()
         )
         doubts = [found for found in judged if found is not None]
@@ -452,7 +443,7 @@ class TableImport:
             if strict and not (self._strict or refused):
                 break
             try:
-                refuse_guesses(reader.path, doubts, grounds, names)
+                plausibility.refuse_guesses(reader.path, doubts, grounds, names)
             except RefusedError as error:
                 refused = [one for one in refused if not one.last] + [error]
         if refused:
@@ -460,7 +451,7 @@ class TableImport:
             for sentence in reader.understood():
                 self._progress.say(sentence)
             raise merge_refusals(reader.path, refused)
-        refuse_impossible(reader.path, doubts, names)
+        plausibility.refuse_impossible(reader.path, doubts, names)
         for found in doubts:
             self._progress.warn(found.advice(names[found.signal]))
 
@@ -489,5 +480,5 @@ def _merged(blocks: Iterable[Readings], further: list[Series]) -> Iterator[Readi
 
 
 def _in_order(parts: list[Readings]) -> Readings:
-    whole = joined(parts)
-    return selected(whole, np.argsort(whole.time_ns, kind='stable'))
+    whole = plausibility.joined(parts)
+    return plausibility.selected(whole, np.argsort(whole.time_ns, kind='stable'))
