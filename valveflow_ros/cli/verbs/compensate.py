@@ -283,10 +283,12 @@ def _pieces(made: Compensation, pressures: Sequence[float]) -> str:
     factors = [p**made.curve.pressure_exponent for p in pressures]
     pairs = zip(made.curve.pieces, made.gains, strict=True)
     for k, (piece, gain) in enumerate(pairs, made.first_piece):
-        ends = piece.u_from, piece.u_to
+        low, high = piece.u_from, piece.u_to
         rows.append([
-            str(k), span(*(piece.slope * u + piece.intercept for u in ends)), span(*ends),
-            plain(float(gain), 3), *(span(*(u / f for u in ends), 2) for f in factors),
+            str(k),
+            span(piece.slope * low + piece.intercept, piece.slope * high + piece.intercept),
+            span(low, high), plain(float(gain), 3),
+            *(span(low / f, high / f, 2) for f in factors),
             'yes' if gain <= made.gain_limit else 'no',
         ])  # fmt: skip
     head = ['piece', 'power (MW)', 'u', 'u per MW']

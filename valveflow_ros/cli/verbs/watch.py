@@ -190,7 +190,7 @@ def _watch_ros(options: Namespace) -> NoReturn:
     if options.page:
         module, words = _PAGE_MODULE, ['--host', options.host, '--port', str(options.port)]
         words += [word for name in options.name for word in ('--name', name)]
-        handed = ('node', 'token_file', 'on_alarm', 'webhook')
+        handed: tuple[str, ...] = ('node', 'token_file', 'on_alarm', 'webhook')
     else:
         module, words = _MODULE, ['--interval', str(options.interval)]
         words += [f'--{name}' for name in ('once', 'json') if getattr(options, name)]
