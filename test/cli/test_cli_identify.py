@@ -188,30 +188,21 @@ def test_a_log_without_a_signal_names_the_two_options(run, logs, tmp_path):
     assert ran.json['signals']['main_steam_pressure']['low'] > 0.0
 
 
-@pytest.mark.parametrize(
-    ('name', 'content'),
-    [
-        ('none.mcap', None),
-        ('empty.mcap', b''),
-        ('text.mcap', b'this is no recording at all'),
-        ('cut.mcap', b'\x89MCAP0\r\n'),
-        ('folder', 'folder'),
-        ('log.bag', b'#ROSBAG V2.0'),
-    ],
-)
-@pytest.mark.parametrize('verb', ['identify', 'info', 'export', 'recover'])
-def test_files_that_are_no_logs(run, tmp_path, verb, name, content):
-    place = tmp_path / name
-    if content == 'folder':
-        place.mkdir()
-    elif content is not None:
-        place.write_bytes(content)
-    output = {'identify': 'out', 'export': 'o.csv', 'recover': 'o.mcap'}.get(verb)
-    words = [verb, place] + (['-o', tmp_path / output] if output else [])
-    sentence = run(*words).refused()
-    assert name in sentence
-    if output:
-        assert not (tmp_path / output).exists()
+@pytest.mark.parametrize('verb', ['identify', 'info', 'export', 'recover', 'import'])
+def test_files_that_are_no_logs(run, tmp_path, verb):
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'empty.mcap').write_bytes(b'')
+    (tmp_path / 'text.mcap').write_bytes(b'this is no recording at all')
+    (tmp_path / 'cut.mcap').write_bytes(b'\x89MCAP0\r\n')
+    (tmp_path / 'log.bag').write_bytes(b'#ROSBAG V2.0')
+    (tmp_path / 'empty.csv').write_bytes(b'')
+    (tmp_path / 'text.parquet').write_bytes(b'no parquet at all')
+    names = sorted(p.name for p in tmp_path.iterdir())
+    output = {'identify': 'out', 'export': 'o.csv', 'recover': 'o.mcap', 'import': 'o.mcap'}
+    words = ['-o', tmp_path / output[verb]] if verb in output else []
+    for name in [*names, 'none.mcap']:
+        assert name in run(verb, tmp_path / name, *words).refused()
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
 
 
 def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):

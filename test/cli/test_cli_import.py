@@ -141,41 +141,10 @@ def test_what_cannot_be_imported_is_refused_and_nothing_written(
     assert not (tmp_path / 'x.mcap').exists()
 
 
-@pytest.mark.parametrize(
-    ('name', 'content', 'part'),
-    [
-        ('none.csv', None, 'no such file'),
-        ('empty.csv', '', 'empty'),
-        ('empty.parquet', '', 'empty'),
-        ('head.csv', HEADER + '\n', 'without rows'),
-        ('picture.csv', '\x00\x01\x02\x03', ''),
-        ('table.xlsx', 'PK', 'table.xlsx'),
-        ('table.ods', 'PK', 'no .csv, .xlsx or .parquet'),
-        ('text.parquet', 'no parquet at all', ''),
-    ],
-)
-def test_files_that_are_no_tables(run, tmp_path, name, content, part):
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    sentence = run('import', tmp_path / name, '-o', tmp_path / 'x.mcap', *OPTIONS).refused()
-    assert part in sentence
-    assert name in sentence
-
-
 def test_the_output_is_checked_before_the_work(run, history):
     before = history.read_bytes()
     assert 'is the log that is read' in run('import', history, '-o', history, *OPTIONS).refused()
     assert history.read_bytes() == before
-
-
-def test_a_column_that_gives_way_to_a_constant_is_not_used(run, tmp_path, write_csv):
-    header = 'time,' + ','.join(i.column for i in SIGNALS if i.required)
-    table = write_csv(header, [f'{1700000000 + k},50,12,540,200' for k in range(5)])
-    log = tmp_path / 'x.mcap'
-    ran = run('import', table, '-o', log, '--constant', 'main_steam_pressure=9')
-    assert 'the constant is used instead' in ran.err
-    assert 'Not used: main_steam_pressure_mpa.' in ran.out
-    assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == [9.0] * 5
 
 
 def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_csv):

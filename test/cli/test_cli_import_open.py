@@ -171,10 +171,7 @@ def frame():
     ('column', 'topic', 'middle', 'units'),
     [
         ('main_steam_temperature_degc', 'main_steam_temperature', 812, ['K', 'degF']),
-        ('main_steam_temperature_degc', 'main_steam_temperature', 1000, ['degF']),
         ('main_steam_pressure_mpa', 'main_steam_pressure', 2400, ['psi', 'kPa']),
-        ('main_steam_pressure_mpa', 'main_steam_pressure', 5000, ['kPa', 'psi']),
-        ('main_steam_pressure_mpa', 'main_steam_pressure', 16500, ['kPa']),
         ('generated_power_mw', 'generated_power', 250_000, ['kW']),
     ],
 )
@@ -235,10 +232,7 @@ def test_a_period_that_is_none_is_refused(run, tmp_path, frame, said):
     ('pressure', 'words'),
     [
         (-1.0 * ROWS, 'name the right column'),
-        (0.0 * ROWS, 'name the right column'),
-        (1e5 + ROWS, 'name the right column'),
         (1.6e7 + ROWS, 'main_steam_pressure_mpa:Pa'),
-        (1e9 + ROWS, 'name the right column'),
         (160.0 + ROWS, 'main_steam_pressure_mpa:bar'),
     ],
 )
