@@ -44,6 +44,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
         console.say(told)
     from valveflow_ros.interface.logs import open_log, steps_of
     from valveflow_ros.interface.settings import settings_for
+    from valveflow_ros.records import SIGNALS
 
     log = open_log(options.log, mapping, progress=console)
     parts = log.recorded.by_signal()
@@ -62,10 +63,9 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     data_ns = (int(times.min()), int(times.max())) if len(times) else (None, None)
     seconds = 0.0 if start is None or end is None else (end - start) / 1e9
     signals = {
-        info['topic']: info
+        SIGNALS[s].topic: _facts(log, s, parts[s], steps.get(s, float('nan')), stands_s)
         for s in sorted({*contents.signals, *log.constants})
         if s in parts
-        for info in [_facts(log, s, parts[s], steps.get(s, float('nan')), stands_s)]
     }
     data = {
         'log': contents.path,
@@ -85,7 +85,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
         ],
         'signals': {
             topic: {
-                **{k: v for k, v in facts.items() if k not in ('topic', 'gaps')},
+                **facts,
                 'gaps': len(facts['gaps']),
                 'longest_gap_s': facts['gaps'][0].seconds if facts['gaps'] else 0.0,
             }
@@ -235,7 +235,6 @@ def _facts(
     """Return the description of one signal, in the unit of the engine."""
     import numpy as np
 
-    from valveflow_ros.records import SIGNALS
     from valveflow_ros.report.data import gaps
     from valveflow_ros.signals.units import engine_unit
 
@@ -249,7 +248,6 @@ def _facts(
         (known.min(), np.median(known), known.max()) if len(known) else (np.nan,) * 3
     )
     return {
-        'topic': SIGNALS[signal].topic,
         'source': 'constant' if signal in log.constants else log.name_of(signal),
         'unit': engine_unit(signal, log.units.get(signal, '')),
         'readings': len(values),
