@@ -35,14 +35,17 @@ class Ran:
     out: str
     err: str
 
+    def done(self) -> Ran:
+        """Assert that it was done; return it."""
+        assert self.status == 0, self.err
+        return self
+
     @property
     def json(self) -> dict[str, Any]:
-        assert self.status == 0, self.err
-
         def refuse(word: str) -> None:
             raise AssertionError(f'{word} is no JSON')
 
-        content: dict[str, Any] = json.loads(self.out, parse_constant=refuse)
+        content: dict[str, Any] = json.loads(self.done().out, parse_constant=refuse)
         return content
 
     def refused(self, status: int = 1) -> str:
@@ -87,8 +90,7 @@ def logs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('logs')
     for name in ('plant.csv', 'plant.parquet', 'plant.mcap', 'other.mcap'):
         seed = 2 if name == 'other.mcap' else 1
-        ran = run('simulate', '-o', folder / name, '--days', '0.4', '--seed', seed)
-        assert ran.status == 0, ran.err
+        run('simulate', '-o', folder / name, '--days', '0.4', '--seed', seed).done()
     return folder
 
 
@@ -98,9 +100,7 @@ def identification(
 ) -> tuple[Ran, Path]:
     """Return what identify said of plant.csv, and its folder."""
     folder = tmp_path_factory.mktemp('identified')
-    ran = run('identify', logs / 'plant.csv', '-o', folder)
-    assert ran.status == 0, ran.err
-    return ran, folder
+    return run('identify', logs / 'plant.csv', '-o', folder).done(), folder
 
 
 @pytest.fixture(scope='session')

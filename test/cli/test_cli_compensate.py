@@ -59,8 +59,7 @@ def rows_of(path):
 
 
 def test_the_table_brings_back_the_power(compensate, model, tmp_path):
-    ran = compensate(model(), '--pressure', '16.7')
-    assert ran.status == 0, ran.err
+    ran = compensate(model(), '--pressure', '16.7').done()
     rows = rows_of(tmp_path / 't.csv')
     assert len(rows) == 16
     power, u = (np.array([row[name] for row in rows]) for name in ('power_mw', 'u'))
@@ -191,8 +190,7 @@ def test_openings_that_were_not_seen_at_a_pressure_are_marked(compensate, model,
     seen = openings_seen(np.append(opening, np.nan), np.append(pressure, 30.0))
     ran = compensate(
         model(openings_seen=seen), *(f'--pressure={p}' for p in ('9.5', '10.5', '20'))
-    )
-    assert ran.status == 0, ran.err
+    ).done()
     rows = rows_of(tmp_path / 't.csv')
     for p, low, high in ((9.5, 40.0, 60.0), (10.5, 60.0, 80.0)):
         for row in rows:

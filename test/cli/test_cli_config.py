@@ -31,8 +31,7 @@ def slow_table(tmp_path_factory):
 
 def test_the_file_is_taken_and_says_what_it_is_from(run, slow_table, tmp_path):
     file = tmp_path / 'monitor.yaml'
-    ran = run('config', 'init', slow_table, '-o', file, '--unit-tag', 'U3', '--json')
-    assert ran.status == 0, ran.err
+    ran = run('config', 'init', slow_table, '-o', file, '--unit-tag', 'U3', '--json').done()
     fitted = ran.json['fitted']
     settings = Settings(read_parameters(file, []))
     assert settings['sample_period'] == 10.0
@@ -58,8 +57,7 @@ def test_the_file_is_taken_and_says_what_it_is_from(run, slow_table, tmp_path):
 def test_a_short_log_leaves_the_noise_to_the_monitor(run, slow_table, tmp_path):
     short = tmp_path / 'short.csv'
     short.write_text('\n'.join(slow_table.read_text().splitlines()[:30]))
-    ran = run('config', 'init', short)
-    assert ran.status == 0, ran.err
+    ran = run('config', 'init', short).done()
     assert '# input_noise and power_noise: the log is too short' in ran.out
     assert '# time_constant and delay: kept at their defaults' in ran.out
     assert 'input_noise: 0.0' in ran.out
@@ -107,8 +105,7 @@ def test_a_column_s_name_cannot_write_parameters(run, tmp_path):
         'main_steam_temperature_degc': 540.0, 'generated_power_mw': 230.0 + np.arange(n) % 9,
     })  # fmt: skip
     frame.to_parquet(tmp_path / 'x\n    unit_tag: OWNED.parquet')
-    ran = run('config', 'init', *tmp_path.glob('*.parquet'))
-    assert ran.status == 0, ran.err
+    ran = run('config', 'init', *tmp_path.glob('*.parquet')).done()
     lines = [line for line in ran.out.splitlines() if 'OWNED' in line]
     assert len(lines) == 2
     assert all(line.lstrip().startswith('#') for line in lines)

@@ -21,8 +21,7 @@ def held(run, logs, tmp_path_factory):
     folder = tmp_path_factory.mktemp('extended')
     model = write_extended(folder / 'model.json', **HELD)
     words = '--set', f'model_file={model}'
-    ran = run('identify', logs / 'plant.parquet', '-o', folder / 'out', *words)
-    assert ran.status == 0, ran.err
+    ran = run('identify', logs / 'plant.parquet', '-o', folder / 'out', *words).done()
     assert f'{REMOVED} from the data first' in ran.out
     assert 'backlash (w_percent = 0.1)' in ran.out
     return folder / 'out'
@@ -63,8 +62,7 @@ def test_what_the_extended_model_knows_is_no_finding(run, logs, held, tmp_path):
     """A diagnosis on top of a model says what differs from it, and keeps it inside its own."""
     out = tmp_path / 'd'
     ran = run('diagnose', logs / 'plant.parquet', '-o', out, '--quiet', '--model',
-              held / 'extended_model.json')  # fmt: skip
-    assert ran.status == 0, ran.err
+              held / 'extended_model.json').done()  # fmt: skip
     assert 'output_offset_drift (b_mw = 8)' in ran.out
     content = json.loads((out / 'extended_model.json').read_text())
     assert [c['name'] for c in content['on_top_of']['causes']] == list(HELD)

@@ -42,8 +42,7 @@ def history(write_csv):
 
 def test_columns_are_converted_and_told(run, tmp_path, history):
     log = tmp_path / 'x.mcap'
-    ran = run('import', history, '-o', log, *OPTIONS)
-    assert ran.status == 0, ran.err
+    ran = run('import', history, '-o', log, *OPTIONS).done()
     k = np.arange(50)
     assert np.allclose(values(log, Signal.VALVE_OPENING), 50.0 + 0.1 * k)
     assert np.allclose(values(log, Signal.MAIN_STEAM_PRESSURE), 13.0 + 0.01 * k)
@@ -66,8 +65,7 @@ def test_constants_stand_in_every_row(run, tmp_path, history):
     log = tmp_path / 'x.mcap'
     words = [*OPTIONS[:4], *OPTIONS[8:], '--constant', 'main_steam_pressure=120:bar',
              '--constant', 'main_steam_temperature_degc=540']  # fmt: skip
-    ran = run('import', history, '-o', log, *words)
-    assert ran.status == 0, ran.err
+    ran = run('import', history, '-o', log, *words).done()
     assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == pytest.approx([12.0] * 50)
     assert values(log, Signal.MAIN_STEAM_TEMPERATURE).tolist() == [540.0] * 50
     assert 'constant' in ran.out
@@ -156,15 +154,13 @@ def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_
         'time,valve_opening,main_steam_pressure,main_steam_temperature,generated_power,'
         'Vacuum [kPa],temperature,Spare', mine,
     )  # fmt: skip
-    ran = run('import', table, '-o', tmp_path / 'without.mcap')
-    assert ran.status == 0, ran.err
+    ran = run('import', table, '-o', tmp_path / 'without.mcap').done()
     assert (
         'Of these Vacuum [kPa], temperature hold numbers; if the power may follow one of them, '
         "keep it with --covariate 'vacuum=Vacuum [kPa]'." in ran.out
     )
     log = tmp_path / 'x.mcap'
-    ran = run('import', table, '-o', log, '--covariate', 'vacuum=Vacuum', '--json')
-    assert ran.status == 0, ran.err
+    ran = run('import', table, '-o', log, '--covariate', 'vacuum=Vacuum', '--json').done()
     assert ran.json['ignored'] == ['temperature', 'Spare']
     (kept,) = ran.json['covariates']
     assert (kept['name'], kept['unit'], kept['low'], kept['high']) == ('vacuum', 'kPa', 5.0, 5.06)
@@ -218,8 +214,7 @@ def german(tmp_path):
 
 def test_a_german_export_needs_no_option(run, german, tmp_path):
     log = tmp_path / 'x.mcap'
-    ran = run('import', german, '-o', log)
-    assert ran.status == 0, ran.err
+    ran = run('import', german, '-o', log).done()
     k = np.arange(N)
     assert np.allclose(values(log, Signal.MAIN_STEAM_PRESSURE), 13.0 + 0.1 * k)
     power = values(log, Signal.GENERATED_POWER)
@@ -277,8 +272,7 @@ def test_what_can_be_read_in_two_ways_is_refused_with_the_option(
     sentence = run('import', german, '-o', tmp_path / 'x.mcap').refused()
     assert said in sentence
     assert option in sentence
-    ran = run('import', german, '-o', tmp_path / 'x.mcap', *option.split())
-    assert ran.status == 0, ran.err
+    ran = run('import', german, '-o', tmp_path / 'x.mcap', *option.split()).done()
     assert f'Not used: {unused}.' in ran.out
     assert not list(tmp_path.glob('*.draft*'))
 
@@ -296,8 +290,7 @@ def test_blocks_and_order_change_nothing(run, german, tmp_path, monkeypatch, ord
     monkeypatch.setattr(file, 'BLOCK_ROWS', 7)
     monkeypatch.setattr(table_import, '_ROWS', 11)
     (tmp_path / 'parts').mkdir()
-    ran = run('import', german, '-o', tmp_path / 'parts' / 'x.mcap')
-    assert ran.status == 0, ran.err
+    ran = run('import', german, '-o', tmp_path / 'parts' / 'x.mcap').done()
     assert ('sorted' in ran.err) == (order != 'as it stands')
     one, two = open_log(tmp_path / 'whole.mcap'), open_log(tmp_path / 'parts' / 'x.mcap')
     assert np.array_equal(one.readings.time_ns, two.readings.time_ns)
@@ -314,8 +307,7 @@ def test_a_row_for_each_value_becomes_a_log(run, tmp_path):
     table = tmp_path / 'long.csv'
     table.write_text('\n'.join(lines))
     constant = ('--constant', 'main_steam_temperature=540')
-    ran = run('import', table, '-o', tmp_path / 'x.mcap', *constant)
-    assert ran.status == 0, ran.err
+    run('import', table, '-o', tmp_path / 'x.mcap', *constant).done()
     readings = open_log(tmp_path / 'x.mcap').readings
     assert [int((readings.signal == s).sum()) for s in Signal] == [30, 30, 30, 30, 0]
     assert np.isfinite(readings.value).all()

@@ -56,8 +56,7 @@ def test_everything_comes_together_and_the_last_line_works(run, table, tmp_path)
                    "'generated_power=Gross MW:kW'"):  # fmt: skip
         assert said.count(option) == 2, option
     assert not log.exists()
-    ran = run(*last_command(said))
-    assert ran.status == 0, ran.err
+    ran = run(*last_command(said)).done()
     assert 'Warning' not in ran.err
     assert np.allclose(values(log, Signal.MAIN_STEAM_PRESSURE), 13.0 + np.arange(N) / 100)
 
@@ -143,8 +142,7 @@ def test_a_gauge_pressure_can_be_said(run, table, tmp_path, header, spelt, unit)
     table.write_text(table.read_text().replace('Steam press', header))
     engine = convert(Signal.MAIN_STEAM_PRESSURE, unit, np.array([130.0]))[0]
     pressure = f'main_steam_pressure={header}:{spelt}'
-    ran = run('import', table, '-o', tmp_path / 'x.mcap', *SAID, pressure)
-    assert ran.status == 0, ran.err
+    ran = run('import', table, '-o', tmp_path / 'x.mcap', *SAID, pressure).done()
     told = f"'{header}' is a gauge pressure ({unit}); "
     assert (told in ran.out) == ('the standard atmosphere, are added' in ran.out)
     assert (told in ran.out) == (unit != 'bar')
@@ -193,8 +191,7 @@ def test_every_unit_that_fits_is_proposed(run, tmp_path, frame, column, topic, m
 def test_an_index_without_a_name_is_the_time(run, tmp_path, frame, kind):
     path = tmp_path / f'a.{kind}'
     frame.to_csv(path) if kind == 'csv' else frame.to_parquet(path)
-    ran = run('import', path, '-o', tmp_path / 'x.mcap')
-    assert ran.status == 0, ran.err
+    run('import', path, '-o', tmp_path / 'x.mcap').done()
     assert open_log(tmp_path / 'x.mcap').start_ns == frame.index[0].value
 
 
@@ -210,8 +207,7 @@ def test_a_temperature_that_fits_is_not_doubted_and_a_count_is_no_time(run, tmp_
 def test_a_table_without_times_has_a_period(run, tmp_path, frame, said):
     path, log = tmp_path / 'a.csv', tmp_path / 'x.mcap'
     frame.to_csv(path, index=False)
-    ran = run('import', path, '-o', log, '--period', said)
-    assert ran.status == 0, ran.err
+    ran = run('import', path, '-o', log, '--period', said).done()
     assert 'The table has no times; its rows were taken to be 60 s apart' in ran.out + ran.err
     pressure = frame['main_steam_pressure_mpa'].to_numpy()
     assert np.array_equal(values(log, Signal.MAIN_STEAM_PRESSURE), pressure)
@@ -274,8 +270,7 @@ def test_what_import_understood_of_a_flow_stays_in_its_recording(run, tmp_path):
         'import', table, '-o', log, '--column', 'valve_opening=LV', '--column',
         'main_steam_pressure=DP:mbard', '--column', 'generated_power=FT', '--constant',
         'main_steam_temperature=20',
-    )  # fmt: skip
-    assert ran.status == 0, ran.err
+    ).done()  # fmt: skip
     assert 'kg/s' in ran.out
     assert 'MW' not in ran.out + ran.err
     read = vf.open_log(log)

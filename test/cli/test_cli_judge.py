@@ -23,8 +23,7 @@ def diagnosed(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp('diagnosed')
     log, spikes = folder / 'plant.parquet', 'spikes:height=60,per_day=60'
     run('simulate', '-o', log, '--days', '1.3', '--seed', '2', '--effect', spikes)
-    ran = run('diagnose', log, '-o', folder / 'out', '--quiet')
-    assert ran.status == 0, ran.err
+    ran = run('diagnose', log, '-o', folder / 'out', '--quiet').done()
     return ran.out, folder / 'out'
 
 
@@ -89,8 +88,7 @@ def held_out(run, logs, truth, tmp_path_factory):
     """Compare once for all tests that look at the result."""
     folder = tmp_path_factory.mktemp('compared') / 'out'
     words = ['compare', logs / 'plant.mcap', '-o', folder, '--truth', truth, '--table']
-    ran = run(*words)
-    assert ran.status == 0, ran.err
+    ran = run(*words).done()
     return ran, folder
 
 
@@ -180,8 +178,7 @@ def test_other_days_and_json(run, logs, tmp_path):
     """The same log is no other day, but takes the same way; and shows that learnt data flatter."""
     quick = ['--set', 'refine=false', '--set', 'selection_rule=paper']
     ran = run('compare', logs / 'plant.csv', '-o', tmp_path / 'a', '--test', logs / 'plant.csv',
-              '--json', *quick)  # fmt: skip
-    assert ran.status == 0, ran.err
+              '--json', *quick).done()  # fmt: skip
     content = ran.json
     assert content['held_out'] is False
     assert 'segments' not in content
@@ -208,8 +205,7 @@ def test_the_true_curve_holds_on_its_plant(run, logs, model, tmp_path):
     ran = run(
         'validate', logs / 'plant.mcap', '--model', model(), '-o', tmp_path / 'out',
         '--tolerance', '3', '--table',
-    )  # fmt: skip
-    assert ran.status == 0, ran.err
+    ).done()  # fmt: skip
     content = json.loads((tmp_path / 'out' / 'validation.json').read_text())
     assert (content['format'], content['version']) == ('valveflow/validation', 1)
     # Ten hours hold few segments a piece, so that some may stay open; none may be off.
@@ -260,8 +256,9 @@ def test_a_wrong_curve_is_off_and_the_right_one_better(run, logs, model, tmp_pat
 
 def test_a_curve_that_is_too_short_is_flagged(run, logs, model, tmp_path):
     knots = (1000.0, 1100.0, 1200.0, 1300.0, 1500.0)
-    ran = run('validate', logs / 'plant.csv', '--model', model(knots=knots), '-o', tmp_path / 'o')
-    assert ran.status == 0, ran.err
+    ran = run(
+        'validate', logs / 'plant.csv', '--model', model(knots=knots), '-o', tmp_path / 'o'
+    ).done()
     content = json.loads((tmp_path / 'o' / 'validation.json').read_text())
     assert 0.05 < content['outside_share'] < 1.0
     assert 'Warning: ' in ran.err

@@ -27,8 +27,7 @@ SHORT = ['--days', '0.02', '--seed', '4']
 def test_every_kind_of_log_holds_the_same(run, tmp_path):
     names = ['a.csv', 'a.parquet', 'a.mcap', 'bag']
     for name in names:
-        ran = run('simulate', '-o', tmp_path / name, *SHORT)
-        assert ran.status == 0, ran.err
+        ran = run('simulate', '-o', tmp_path / name, *SHORT).done()
         assert name in ran.out
     first = open_log(tmp_path / names[0]).readings
     for name in names[1:]:
@@ -113,8 +112,9 @@ def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
 
 def test_another_unit_and_recording_are_simulated_and_told(run, tmp_path):
     words = ['simulate', '-o', tmp_path / 'a.csv', *SHORT, '--unit', 'choked', '--recording']
-    ran = run(*words, 'minute', '--truth', tmp_path / 't.json', '--effect', 'area_step:t0_days=0')
-    assert ran.status == 0, ran.err
+    ran = run(
+        *words, 'minute', '--truth', tmp_path / 't.json', '--effect', 'area_step:t0_days=0'
+    ).done()
     assert 'choked: flow p^m f(V)' in ran.out
     assert 'recorded minute' in ran.out
     truth = json.loads((tmp_path / 't.json').read_text())
