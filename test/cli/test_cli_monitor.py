@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import pytest
 
-import valveflow_ros as vf
 from valveflow_ros.interface import monitor as monitoring
 from valveflow_ros.interface.fleets import fleet as fleets
 from valveflow_ros.interface.fleets.unit_logs import read_options
@@ -38,8 +37,6 @@ def test_a_fault_stands_to_the_end_and_files_and_answer_say_the_same(run, tmp_pa
     assert content['diagnoses'] == []
     answer = json.loads(ran.out)
     assert {key: answer[key] for key in content} == content
-    slow = {'sample_period': 10.0}
-    assert vf.monitor(log, diagnose=False, parameters=slow).to_json() == content
     residual = [a for a in content['alarms'] if a['name'] == 'residual']
     assert [(a['state'], a['cleared']) for a in residual] == [('unacknowledged', None)]
     raised = residual[0]['raised']

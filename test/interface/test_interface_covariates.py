@@ -21,6 +21,11 @@ from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.signals.covariates import entry
 
 COLUMN = 'condenser_pressure_kpa'
+# The monitor diagnoses twice: after the first day, and one day later.
+NIGHTLY = {
+    'reference_after': 0.0, 'diagnosis_on_mismatch': False, 'refit_period': 86400.0,
+    'refit_segments': 0,
+}  # fmt: skip
 
 
 @pytest.fixture(scope='module')
@@ -143,7 +148,7 @@ def test_a_curve_and_a_monitor_without_the_weather(plant, diagnosed, tmp_path):
     rmse = [r.characteristic.residuals.rmse_mw for r in (plain, freed)]
     assert rmse[1] < 0.75 * rmse[0]
     assert [h.name for h in freed.characteristic.held] == list(model.model.names)
-    told = vf.monitor(path, model=model, diagnose=False)
+    told = vf.monitor(path, model=model, diagnose=False, parameters=NIGHTLY)
     assert told.curves[-1][1].residuals.rmse_mw < 0.75 * rmse[0]
     without = plant.to_dataframe().drop(columns=COLUMN)
     with pytest.raises(InputError, match=f"has no column or topic '{COLUMN}"):
@@ -198,13 +203,6 @@ def test_it_is_the_same_from_a_file(plant, tmp_path, kind):
     from_frame = read_covariate(open_log(plant.to_dataframe()), 'vacuum', COLUMN)
     np.testing.assert_array_equal(from_file.time_ns, from_frame.time_ns)
     np.testing.assert_array_equal(from_file.values, from_frame.values)
-
-
-# The monitor diagnoses twice: after the first day, and one day later.
-NIGHTLY = {
-    'reference_after': 0.0, 'diagnosis_on_mismatch': False, 'refit_period': 86400.0,
-    'refit_segments': 0,
-}  # fmt: skip
 
 
 @needs_jit
