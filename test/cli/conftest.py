@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,6 @@ from valveflow_ros.cli.main import main
 from valveflow_ros.curve.characteristic import RegionDynamics
 from valveflow_ros.curve.characteristic_json import to_json
 
-# Long enough for a curve of several pieces, short enough for a test.
-DAYS, SEED = '0.4', '1'
 # The curve and the dynamics of the paper's plant.
 KNOTS, SLOPES = (1000.0, 1250.0, 1600.0, 1900.0, 2600.0), (0.24, 0.18, 0.09, 0.01)
 REGIONS = (
@@ -35,12 +35,17 @@ class Ran:
     out: str
     err: str
 
+    def done(self) -> Ran:
+        """Assert that it was done; return it."""
+        assert self.status == 0, self.err
+        return self
+
     @property
     def json(self) -> dict[str, Any]:
         def refuse(word: str) -> None:
             raise AssertionError(f'{word} is no JSON')
 
-        content: dict[str, Any] = json.loads(self.out, parse_constant=refuse)
+        content: dict[str, Any] = json.loads(self.done().out, parse_constant=refuse)
         return content
 
     def refused(self, status: int = 1) -> str:
@@ -64,33 +69,44 @@ class Ran:
 Run = Callable[..., Ran]
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def command(*words: object) -> Ran:
-        capsys.readouterr()
+def run_command(*words: object) -> Ran:
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
         status = main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        return Ran(status, out, err)
-
-    return command
+    return Ran(status, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope='session')
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with one simulated log as plant.csv, plant.parquet and plant.mcap."""
+def run() -> Run:
+    return run_command
+
+
+@pytest.fixture(scope='session')
+def logs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one log as plant.csv, .parquet and .mcap, and other days.
+
+    Ten hours are long enough for a curve of several pieces, short enough for a test.
+    """
     folder = tmp_path_factory.mktemp('logs')
-    for name in ('plant.csv', 'plant.parquet', 'plant.mcap'):
-        words = ['simulate', '-o', str(folder / name), '--days', DAYS, '--seed', SEED, '--quiet']
-        assert main(words) == 0
+    for name in ('plant.csv', 'plant.parquet', 'plant.mcap', 'other.mcap'):
+        seed = 2 if name == 'other.mcap' else 1
+        run('simulate', '-o', folder / name, '--days', '0.4', '--seed', seed).done()
     return folder
 
 
 @pytest.fixture(scope='session')
-def identified(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the characteristic.json of the simulated log."""
+def identification(
+    run: Run, logs: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Ran, Path]:
+    """Return what identify said of plant.csv, and its folder."""
     folder = tmp_path_factory.mktemp('identified')
-    assert main(['identify', str(logs / 'plant.csv'), '-o', str(folder), '--quiet']) == 0
-    return folder / 'characteristic.json'
+    return run('identify', logs / 'plant.csv', '-o', folder).done(), folder
+
+
+@pytest.fixture(scope='session')
+def identified(identification: tuple[Ran, Path]) -> Path:
+    """Return the characteristic.json of the simulated log."""
+    return identification[1] / 'characteristic.json'
 
 
 @pytest.fixture

@@ -34,26 +34,25 @@ def usual_terminal(monkeypatch):
     monkeypatch.setenv('TERM', 'xterm')
 
 
-def test_progress_is_for_terminals_only():
-    err = io.StringIO()
-    Console(io.StringIO(), err)(0.5, 'working')
-    assert err.getvalue() == ''
-    err = Terminal()
-    Console(io.StringIO(), err)(0.5, 'working')
-    assert '50 %  working' in err.getvalue()
+def console_on(err, **more):
+    return Console(io.StringIO(), err, **more)
 
 
-@pytest.mark.parametrize('setting', ['quiet', 'dumb'])
-def test_progress_can_be_silenced(monkeypatch, setting):
-    monkeypatch.setenv('TERM', 'dumb' if setting == 'dumb' else 'xterm')
-    err = Terminal()
-    Console(io.StringIO(), err, quiet=setting == 'quiet')(0.5, 'working')
-    assert err.getvalue() == ''
+@pytest.mark.parametrize(('kind', 'term', 'quiet', 'bar'), [
+    (Terminal, 'xterm', False, True), (Terminal, 'xterm', True, False),
+    (Terminal, 'dumb', False, False), (io.StringIO, 'xterm', False, False),
+])  # fmt: skip
+def test_progress_is_for_terminals_only_and_can_be_silenced(monkeypatch, kind, term, quiet, bar):
+    monkeypatch.setenv('TERM', term)
+    err = kind()
+    console_on(err, quiet=quiet)(0.5, 'working')
+    assert ('50 %  working' in err.getvalue()) == bar
+    assert bar or err.getvalue() == ''
 
 
 def test_a_message_takes_the_place_of_the_bar():
     err = Terminal()
-    console = Console(io.StringIO(), err)
+    console = console_on(err)
     console(0.1, 'first')
     console.say('Found something.')
     console(0.2, 'second')
@@ -65,7 +64,7 @@ def test_a_message_takes_the_place_of_the_bar():
 
 def test_a_bar_of_one_piece_of_work_is_not_redrawn_all_the_time():
     err = Terminal()
-    console = Console(io.StringIO(), err)
+    console = console_on(err)
     for k in range(10_000):
         console(k / 10_000, 'working')
     assert err.getvalue().count('\r') < 100
@@ -73,7 +72,7 @@ def test_a_bar_of_one_piece_of_work_is_not_redrawn_all_the_time():
 
 def test_quiet_keeps_warnings():
     err = io.StringIO()
-    console = Console(io.StringIO(), err, quiet=True)
+    console = console_on(err, quiet=True)
     console.say('Nice to know.')
     console.warn('Need to know.')
     assert err.getvalue() == 'Warning: Need to know.\n'
@@ -83,14 +82,13 @@ def test_results_go_to_stdout_as_text_or_json():
     outcome = VerbResult(
         'A text.', {'a': [1.5, float('nan'), (float('inf'), 'ü')], 'b': {'c': None}}
     )
-    for as_json, expected in ((False, 'A text.\n'), (True, None)):
-        out, err = io.StringIO(), io.StringIO()
-        Console(out, err, as_json=as_json).finish(outcome)
-        assert err.getvalue() == ''
-        if expected:
-            assert out.getvalue() == expected
-        else:
-            assert json.loads(out.getvalue()) == {'a': [1.5, None, [None, 'ü']], 'b': {'c': None}}
+    out, err = io.StringIO(), io.StringIO()
+    Console(out, err).finish(outcome)
+    assert (out.getvalue(), err.getvalue()) == ('A text.\n', '')
+    out = io.StringIO()
+    Console(out, err, as_json=True).finish(outcome)
+    assert json.loads(out.getvalue()) == {'a': [1.5, None, [None, 'ü']], 'b': {'c': None}}
+    assert err.getvalue() == ''
 
 
 @given(st.text(st.characters(categories=['Cc', 'Cf', 'L', 'Zl', 'Zp']), max_size=30))

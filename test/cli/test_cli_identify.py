@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 
@@ -11,54 +12,74 @@ import numpy as np
 import pandas as pd
 import pytest
 from logged import rewritten
+from step_plan import StepPlan, step_test
 from streams import needs_jit
 
 from valveflow_ros.curve.characteristic_json import from_json
-from valveflow_ros.logs import open_log, write_table
+from valveflow_ros.logs import open_log, write_samples, write_table
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
+from valveflow_ros.report import drawing
 
 pytestmark = needs_jit
 START_NS = 1_700_000_000 * NS_PER_S
+# Without the joint fit, where only the way to the curve is of interest.
+QUICK = ('--set', 'refine=false', '--set', 'selection_rule=paper')
 
 
 @pytest.fixture(scope='module')
-def results(tmp_path_factory):
-    return tmp_path_factory.mktemp('results')
+def quick(run, logs, tmp_path_factory):
+    """Return what the quick way makes of the log, and its folder."""
+    folder = tmp_path_factory.mktemp('quick') / 'out'
+    return run('identify', logs / 'plant.csv', '-o', folder, '--json', *QUICK), folder
 
 
-@pytest.fixture(scope='module')
-def curves():
-    """Hold what was identified in this module, so that no log is identified twice."""
-    return {}
-
-
-def identified(run, logs, results, curves, name):
-    if name not in curves:
-        ran = run('identify', logs / name, '-o', results / name)
-        assert ran.status == 0, ran.err
-        curves[name] = (ran, json.loads((results / name / 'characteristic.json').read_text()))
-    return curves[name]
-
-
-def test_the_curve_is_the_plants(run, logs, results, curves):
-    _, content = identified(run, logs, results, curves, 'plant.mcap')
-    found = from_json(content)
-    truth = UnitDescription().curve
+def test_the_curve_is_the_plants(identified):
+    content = json.loads(identified.read_text())
+    found, truth = from_json(content), UnitDescription().curve
     u = np.linspace(found.breakpoints[0], found.breakpoints[-1], 200)
     # Ten hours under 3 MW of noise: the curve is near, its pieces need not be all there.
     assert np.sqrt(np.mean((found(u) - truth(u)) ** 2)) < 4.0
-    assert content['format'] == 'valveflow/characteristic'
-    assert content['version'] == 2
+    assert (content['format'], content['version']) == ('valveflow/characteristic', 2)
     assert content['optimal'] is True
+
+
+def test_words_and_report_tell_the_numbers_of_the_json(identification):
+    ran, folder = identification
+    content = json.loads((folder / 'characteristic.json').read_text())
+    report = (folder / 'report.html').read_text()
+    for text in (ran.out, report):
+        assert f'{len(content["pieces"])} piece' in text
+        for piece in content['pieces']:
+            assert f'{piece["u_from"]:.1f} to {piece["u_to"]:.1f}' in text
+        told = np.array([float(number) for number in re.findall(r'\d+(?:\.\d+)?', text)])
+        for region in content['dynamics']:
+            # Told no finer than it is known.
+            off = np.abs(told - region['time_constant_s']).min()
+            assert off <= 0.5 * region['time_constant_stderr_s']
+    assert content['model_id'] in report
+    assert 'plant.csv' in report
+    assert 'Do not rely' not in ran.out
+    assert re.search(r'\bnan\b', ran.out) is None
+
+
+def test_nothing_but_the_result_stands_on_stdout(run, logs, quick):
+    ran, folder = quick
+    assert ran.json['files']['report.html'] == str(folder / 'report.html')
+    assert ran.json['dynamics'] == []
+    assert ran.json['sample_period_s'] == 1.0
+    assert 'shift' not in ran.json
+    assert '\r' not in ran.err, 'a progress bar is for terminals'
+    assert sorted(p.name for p in folder.iterdir()) == ['characteristic.json', 'report.html']
+    again = run('identify', logs / 'plant.csv', '-o', folder, '--json', *QUICK)
+    assert again.json == ran.json, 'a result may be written again'
 
 
 def test_a_part_of_a_log_is_taken_by_its_times(run, logs, tmp_path):
     start, end = '2023-11-15T02:00', '2023-11-15T08:00Z'
-    words = ['identify', logs / 'plant.csv', '-o']
+    words = ['identify', logs / 'plant.csv', *QUICK, '-o']
     ran = run(*words, tmp_path / 'a', '--from', start, '--to', end, '--json')
-    assert ran.status == 0, ran.err
-    window = json.loads(ran.out)['window']
+    window = ran.json['window']
     assert window['start_ns'] == pd.Timestamp(start).value
     assert window['end_ns'] == pd.Timestamp(end).value
     again = run(*words, tmp_path / 'a', '--from', start, '--to', end)
@@ -75,66 +96,24 @@ def test_a_part_of_a_log_is_taken_by_its_times(run, logs, tmp_path):
     assert "'noon' is no time such as" in wrong.refused(2)
 
 
-@pytest.mark.parametrize('name', ['plant.csv', 'plant.parquet'])
-def test_any_kind_of_log_gives_the_same_curve_to_the_last_bit(run, logs, results, curves, name):
-    _, first = identified(run, logs, results, curves, 'plant.mcap')
-    _, other = identified(run, logs, results, curves, name)
-    assert other == first
-
-
-def test_there_and_back_again_gives_the_same_curve(run, logs, results, curves, tmp_path):
-    _, first = identified(run, logs, results, curves, 'plant.mcap')
+def test_there_and_back_again_gives_the_same_curve(run, logs, quick, tmp_path):
     assert run('export', logs / 'plant.mcap', '-o', tmp_path / 'a.parquet').status == 0
     assert run('import', tmp_path / 'a.parquet', '-o', tmp_path / 'b.mcap').status == 0
-    ran = run('identify', tmp_path / 'b.mcap', '-o', tmp_path / 'out', '--json')
-    assert ran.json['model_id'] == first['model_id']
+    ran = run('identify', tmp_path / 'b.mcap', '-o', tmp_path / 'out', '--json', *QUICK)
+    first = json.loads((quick[1] / 'characteristic.json').read_text())
     assert {k: ran.json[k] for k in first} == first
 
 
-def test_words_and_report_tell_the_numbers_of_the_json(run, logs, results, curves):
-    ran, content = identified(run, logs, results, curves, 'plant.mcap')
-    report = (results / 'plant.mcap' / 'report.html').read_text()
-    for text in (ran.out, report):
-        assert f'{len(content["pieces"])} piece' in text
-        for piece in content['pieces']:
-            assert f'{piece["u_from"]:.1f} to {piece["u_to"]:.1f}' in text
-        told = np.array([float(number) for number in re.findall(r'\d+(?:\.\d+)?', text)])
-        for region in content['dynamics']:
-            # Told no finer than it is known.
-            off = np.abs(told - region['time_constant_s']).min()
-            assert off <= 0.5 * region['time_constant_stderr_s']
-    assert content['model_id'] in report
-    assert 'plant.mcap' in report
-    assert re.search(r'\bnan\b', ran.out) is None
-
-
-def test_nothing_but_the_result_stands_on_stdout(run, logs, tmp_path):
-    quick = ['--set', 'refine=false', '--set', 'selection_rule=paper']
-    ran = run('identify', logs / 'plant.csv', '-o', tmp_path / 'out', '--json', *quick)
-    assert ran.json['files']['report.html'] == str(tmp_path / 'out' / 'report.html')
-    assert ran.json['dynamics'] == []
-    assert ran.json['sample_period_s'] == 1.0
-    assert '\r' not in ran.err, 'a progress bar is for terminals'
-    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == [
-        'characteristic.json', 'report.html',
-    ]  # fmt: skip
-    again = run('identify', logs / 'plant.csv', '-o', tmp_path / 'out', '--json', *quick)
-    assert again.json == ran.json, 'a result may be written again'
-
-
-def test_units_and_constants_reach_the_engine(run, logs, results, curves, tmp_path):
-    """The same plant written in other units, under other names, gives the same curve."""
-    _, first = identified(run, logs, results, curves, 'plant.csv')
+def test_units_reach_the_engine(run, logs, quick, tmp_path):
+    """The same plant written in another unit, under another name, gives the same curve."""
     other = rewritten(
         logs / 'plant.csv', tmp_path / 'other.csv', 'generated_power_mw',
         lambda _, mw: repr(float(mw) * 1000.0), 'P gross',
     )  # fmt: skip
-    ran = run('identify', other, '-o', tmp_path / 'out', '--column', 'generated_power=P gross:kW')
-    assert ran.status == 0, ran.err
-    content = json.loads((tmp_path / 'out' / 'characteristic.json').read_text())
-    assert len(content['pieces']) == len(first['pieces'])
-    for mine, theirs in zip(content['pieces'], first['pieces'], strict=True):
-        assert mine['slope'] == pytest.approx(theirs['slope'], rel=1e-6)
+    words = ['--column', 'generated_power=P gross:kW', '--json', *QUICK]
+    pieces = run('identify', other, '-o', tmp_path / 'out', *words).json['pieces']
+    slopes = [piece['slope'] for piece in quick[0].json['pieces']]
+    assert [piece['slope'] for piece in pieces] == pytest.approx(slopes, rel=1e-6)
 
 
 def table(hours, opening, power=None, pressure=12.0, step_s=1):
@@ -209,55 +188,34 @@ def test_a_log_without_a_signal_names_the_two_options(run, logs, tmp_path):
     assert ran.json['signals']['main_steam_pressure']['low'] > 0.0
 
 
-@pytest.mark.parametrize(
-    ('name', 'content'),
-    [
-        ('none.mcap', None),
-        ('empty.mcap', b''),
-        ('text.mcap', b'this is no recording at all'),
-        ('cut.mcap', b'\x89MCAP0\r\n'),
-        ('folder', 'folder'),
-        ('log.bag', b'#ROSBAG V2.0'),
-    ],
-)
-@pytest.mark.parametrize('verb', ['identify', 'info', 'export', 'recover'])
-def test_files_that_are_no_logs(run, tmp_path, verb, name, content):
-    place = tmp_path / name
-    if content == 'folder':
-        place.mkdir()
-    elif content is not None:
-        place.write_bytes(content)
-    output = {'identify': 'out', 'export': 'o.csv', 'recover': 'o.mcap'}.get(verb)
-    words = [verb, place] + (['-o', tmp_path / output] if output else [])
-    sentence = run(*words).refused()
-    assert name in sentence
-    if output:
-        assert not (tmp_path / output).exists()
+@pytest.mark.parametrize('verb', ['identify', 'info', 'export', 'recover', 'import'])
+def test_files_that_are_no_logs(run, tmp_path, verb):
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'empty.mcap').write_bytes(b'')
+    (tmp_path / 'text.mcap').write_bytes(b'this is no recording at all')
+    (tmp_path / 'cut.mcap').write_bytes(b'\x89MCAP0\r\n')
+    (tmp_path / 'log.bag').write_bytes(b'#ROSBAG V2.0')
+    (tmp_path / 'empty.csv').write_bytes(b'')
+    (tmp_path / 'text.parquet').write_bytes(b'no parquet at all')
+    names = sorted(p.name for p in tmp_path.iterdir())
+    output = {'identify': 'out', 'export': 'o.csv', 'recover': 'o.mcap', 'import': 'o.mcap'}
+    words = ['-o', tmp_path / output[verb]] if verb in output else []
+    for name in [*names, 'none.mcap']:
+        assert name in run(verb, tmp_path / name, *words).refused()
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
 
 
 def test_slow_data_are_met_with_fitting_parameters(run, tmp_path):
     log = table(240, stairs, lambda t, rng: 4.0 * stairs(t) + rng.standard_normal(len(t)),
                 step_s=60)  # fmt: skip
     write_table(log, tmp_path / 'log.csv')
-    ran = run('identify', tmp_path / 'log.csv', '-o', tmp_path / 'out', '--json')
-    assert ran.status == 0, ran.err
+    ran = run('identify', tmp_path / 'log.csv', '-o', tmp_path / 'out', '--json').done()
     assert ran.json['sample_period_s'] == 60.0
     assert 'a value every 60 s' in ran.err
     assert 'hold_limit 150 s' in ran.err
     slope = 4.0 / 12.0**1.125
     for piece in ran.json['pieces']:
         assert piece['slope'] == pytest.approx(slope, rel=0.05)
-
-
-def test_readings_that_were_not_used_are_told(run, logs, tmp_path):
-    odd = range(5000, 5010)
-    rewritten(
-        logs / 'plant.csv', tmp_path / 'x.csv', 'generated_power_mw',
-        lambda k, mw: '99999' if k in odd else mw,
-    )  # fmt: skip
-    quick = ['--set', 'refine=false', '--set', 'selection_rule=paper']
-    ran = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out', *quick)
-    assert 'generated_power: 10 impossible value' in ran.out
 
 
 def test_a_curve_that_explains_little_is_not_to_be_relied_on(run, logs, tmp_path):
@@ -268,9 +226,116 @@ def test_a_curve_that_explains_little_is_not_to_be_relied_on(run, logs, tmp_path
         logs / 'plant.csv', tmp_path / 'x.csv', 'generated_power_mw',
         lambda k, _: repr(float(shifted[k])),
     )  # fmt: skip
-    sound = run('identify', logs / 'plant.csv', '-o', tmp_path / 'a')
-    assert 'Do not rely' not in sound.out
     ran = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'b')
-    assert ran.status == 0
     assert 'Do not rely on this curve: it explains only' in ran.out
     assert 'Do not rely on this curve' in (tmp_path / 'b' / 'report.html').read_text()
+
+
+def test_a_curve_is_judged_against_a_reference(run, logs, quick, tmp_path):
+    first, folder = quick
+    assert not (folder / 'shift.json').exists()
+    words = ['identify', logs / 'plant.csv', '-o', tmp_path / 'b', *QUICK, '--reference']
+    again = run(*words, folder)
+    assert again.status == 0, again.err
+    assert 'Against the reference: The curve agrees with the reference of 2023-11-15' in again.out
+    shift = json.loads((tmp_path / 'b' / 'shift.json').read_text())
+    assert (shift['format'], shift['moved']) == ('valveflow/shift', False)
+    assert shift['reference_model_id'] == shift['model_id'] == first.json['model_id']
+    assert [p['shift_mw'] for p in shift['pieces']] == [0.0] * len(first.json['pieces'])
+
+    moved = json.loads((folder / 'characteristic.json').read_text())
+    for piece in moved['pieces']:
+        piece['intercept'] += 9.0
+    model = tmp_path / 'moved.json'
+    model.write_text(json.dumps(moved), encoding='utf-8')
+    ran = run(*words, model, '--json')
+    assert ran.json['shift']['moved'] is True
+    assert ran.json['shift']['sentence'].startswith('At ')
+    sizes = [p['shift_mw'] for p in ran.json['shift']['pieces'] if p['moved']]
+    assert sizes == pytest.approx([-9.0] * len(sizes), abs=1.5)
+    page = (tmp_path / 'b' / 'report.html').read_text(encoding='utf-8')
+    assert 'id="shift"' in page
+
+
+def test_pictures_and_tables_stand_beside_the_report(run, logs, tmp_path):
+    pytest.importorskip('matplotlib')
+    ran = run(
+        'identify', logs / 'plant.csv', '-o', tmp_path, '--figures', '--table', *QUICK
+    ).done()
+    assert f'tables in {tmp_path / "tables"} and pictures in {tmp_path / "figures"}' in ran.out
+    stems = {p.stem for p in (tmp_path / 'tables').iterdir()}
+    assert {'curve', 'signals', 'choice', 'coverage'} <= stems
+    drawn = {p.name for p in (tmp_path / 'figures').iterdir()}
+    assert drawn == {f'{stem}.{kind}' for stem in stems for kind in ('png', 'svg')}
+    content = json.loads((tmp_path / 'characteristic.json').read_text())
+    with (tmp_path / 'tables' / 'curve.csv').open(newline='') as file:
+        rows = [r for r in csv.DictReader(file) if r['line'] == 'flow characteristic']
+    points = [(float(r['x']), float(r['y'])) for r in rows]
+    ends = [(p[end], p['slope'] * p[end] + p['intercept']) for p in content['pieces']
+            for end in ('u_from', 'u_to')]  # fmt: skip
+    np.testing.assert_allclose(points[: len(ends)], ends, rtol=1e-4)
+
+
+@pytest.mark.parametrize('verb', ['identify', 'diagnose', 'compare', 'validate'])
+def test_what_cannot_be_drawn_is_told_before_the_long_work(run, tmp_path, monkeypatch, verb):
+    """The log cannot even be read: the refusal comes first."""
+    log = tmp_path / 'no.mcap'
+    log.write_bytes(b'nothing')
+    model = ['--model', log] if verb == 'validate' else []
+    monkeypatch.setattr(drawing, 'find_spec', lambda name: None)
+    told = run(verb, log, *model, '-o', tmp_path, '--figures').refused()
+    assert 'pip install matplotlib' in told
+    (tmp_path / 'tables').write_text('')
+    told = run(verb, log, *model, '-o', tmp_path, '--table').refused()
+    assert 'tables' in told
+
+
+@pytest.fixture(scope='module')
+def levels_log(tmp_path_factory):
+    """Return the log of a manual test with twelve levels."""
+    path = tmp_path_factory.mktemp('test') / 'test.mcap'
+    plan = StepPlan(opening_from_percent=45.0, opening_to_percent=85.0, steps=11)
+    write_samples(step_test(3, plan).table, path)
+    return path
+
+
+def test_a_step_test_gives_a_curve_others_can_read(run, levels_log, tmp_path):
+    ran = run('identify', levels_log, '-o', tmp_path / 'out', '--step-test').done()
+    assert '12 of 12 levels count' in ran.out
+    curve = from_json(json.loads((tmp_path / 'out' / 'characteristic.json').read_text()))
+    assert curve.choice.rule == 'step_test'
+    page = (tmp_path / 'out' / 'report.html').read_text(encoding='utf-8')
+    assert 'Manual step test' in page
+    assert 'exact partition of the means of the levels' in page
+    made = run('compensate', '--model', tmp_path / 'out', '-o', tmp_path / 'table.csv', '--json')
+    assert made.json['checks']['passed'] is True
+
+
+def test_the_way_to_a_step_test_is_told(run, levels_log, tmp_path):
+    ran = run('identify', levels_log, '-o', tmp_path / 'out', '--set', 'min_fit_samples=100000')
+    refused = ran.refused()
+    assert '--step-test identifies it' in refused
+    assert 'for data of a closed loop do not use it' in refused
+
+
+CONSTANTS = ['--constant', 'main_steam_pressure=1', '--constant', 'main_steam_temperature=540']
+
+
+def test_of_two_measured_loops_one_carries_a_curve(run, shared_data, tmp_path):
+    for name, opening, power in (
+        ('LIC-106_20241121_27.csv', 'LV_106', 'FT_115'),
+        ('FIC-211_20241121_27.csv', 'FV_211', 'FT_211'),
+    ):
+        table, log = shared_data / 'plant_loops' / name, tmp_path / f'{power}.mcap'
+        if not table.is_file():
+            pytest.skip(f'{table} is not there')
+        ran = run('import', table, '-o', log, '--column', f'valve_opening={opening}',
+                  '--column', f'generated_power={power}:t/h', *CONSTANTS).done()  # fmt: skip
+        assert '10\u202f080 rows' in ran.out
+    found = run('identify', tmp_path / 'FT_115.mcap', '-o', tmp_path / 'out', '--json').json
+    (piece,) = found['pieces']
+    assert piece['slope'] > 0.0
+    assert found['sample_period_s'] == 60.0
+    said = run('identify', tmp_path / 'FT_211.mcap', '-o', tmp_path / 'none').refused()
+    assert 'hardly follows the valve' in said
+    assert not (tmp_path / 'none').exists()

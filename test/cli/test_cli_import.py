@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow import``: what historians export, and what is wrong with it."""
+"""``valveflow import``: what historians export, what is seen in it, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ import pytest
 from logged import values
 
 import valveflow_ros as vf
+from valveflow_ros.interface.importing import table_import
 from valveflow_ros.interface.logs import read_covariate
 from valveflow_ros.logs import open_log
+from valveflow_ros.logs.tables import file
 from valveflow_ros.records import SIGNALS, Signal
 
 HEADER = 'Zeit,Spare,CV,PS,TS,MW'
+
+
 OPTIONS = [
     '--column', 'time=Zeit', '--column', 'valve_opening=CV:fraction',
     '--column', 'main_steam_pressure=PS:bar', '--column', 'main_steam_temperature=TS:K',
@@ -38,8 +42,7 @@ def history(write_csv):
 
 def test_columns_are_converted_and_told(run, tmp_path, history):
     log = tmp_path / 'x.mcap'
-    ran = run('import', history, '-o', log, *OPTIONS)
-    assert ran.status == 0, ran.err
+    ran = run('import', history, '-o', log, *OPTIONS).done()
     k = np.arange(50)
     assert np.allclose(values(log, Signal.VALVE_OPENING), 50.0 + 0.1 * k)
     assert np.allclose(values(log, Signal.MAIN_STEAM_PRESSURE), 13.0 + 0.01 * k)
@@ -62,8 +65,7 @@ def test_constants_stand_in_every_row(run, tmp_path, history):
     log = tmp_path / 'x.mcap'
     words = [*OPTIONS[:4], *OPTIONS[8:], '--constant', 'main_steam_pressure=120:bar',
              '--constant', 'main_steam_temperature_degc=540']  # fmt: skip
-    ran = run('import', history, '-o', log, *words)
-    assert ran.status == 0, ran.err
+    ran = run('import', history, '-o', log, *words).done()
     assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == pytest.approx([12.0] * 50)
     assert values(log, Signal.MAIN_STEAM_TEMPERATURE).tolist() == [540.0] * 50
     assert 'constant' in ran.out
@@ -137,59 +139,10 @@ def test_what_cannot_be_imported_is_refused_and_nothing_written(
     assert not (tmp_path / 'x.mcap').exists()
 
 
-@pytest.mark.parametrize(
-    ('name', 'content', 'part'),
-    [
-        ('none.csv', None, 'no such file'),
-        ('empty.csv', '', 'empty'),
-        ('empty.parquet', '', 'empty'),
-        ('head.csv', HEADER + '\n', 'without rows'),
-        ('picture.csv', '\x00\x01\x02\x03', ''),
-        ('table.xlsx', 'PK', 'table.xlsx'),
-        ('table.ods', 'PK', 'no .csv, .xlsx or .parquet'),
-        ('text.parquet', 'no parquet at all', ''),
-    ],
-)
-def test_files_that_are_no_tables(run, tmp_path, name, content, part):
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    sentence = run('import', tmp_path / name, '-o', tmp_path / 'x.mcap', *OPTIONS).refused()
-    assert part in sentence
-    assert name in sentence
-
-
-def test_the_output_is_checked_before_the_work(run, tmp_path, history):
-    log = tmp_path / 'h2.csv'
-    log.write_text(history.read_text())
-    sentence = run('import', log, '-o', log, *OPTIONS).refused()
-    assert 'is the log that is read' in sentence
-    assert log.read_text() == history.read_text()
-
-
-def test_columns_that_are_not_used_are_named_for_parquet_and_semicolons_too(run, tmp_path):
-    import pandas as pd
-
-    names = [i.column for i in SIGNALS if i.required]
-    frame = pd.DataFrame({'time': 1700000000 + np.arange(5), 'A;B': 1.0, 'Note': 'x'})
-    for name, value in zip(names, (50.0, 12.0, 540.0, 200.0), strict=True):
-        frame[name] = value
-    frame.to_parquet(tmp_path / 'h.parquet')
-    frame.drop(columns='A;B').to_csv(tmp_path / 'h.csv', sep=';', decimal=',', index=False)
-    ran = run('import', tmp_path / 'h.parquet', '-o', tmp_path / 'a.mcap', '--json')
-    assert ran.json['ignored'] == ['A;B', 'Note']
-    ran = run('import', tmp_path / 'h.csv', '-o', tmp_path / 'b.mcap', '--json')
-    assert ran.json['ignored'] == ['Note']
-    assert ran.json['signals'][1]['high'] == 12.0
-
-
-def test_a_column_that_gives_way_to_a_constant_is_not_used(run, tmp_path, write_csv):
-    header = 'time,' + ','.join(i.column for i in SIGNALS if i.required)
-    table = write_csv(header, [f'{1700000000 + k},50,12,540,200' for k in range(5)])
-    log = tmp_path / 'x.mcap'
-    ran = run('import', table, '-o', log, '--constant', 'main_steam_pressure=9')
-    assert 'the constant is used instead' in ran.err
-    assert 'Not used: main_steam_pressure_mpa.' in ran.out
-    assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == [9.0] * 5
+def test_the_output_is_checked_before_the_work(run, history):
+    before = history.read_bytes()
+    assert 'is the log that is read' in run('import', history, '-o', history, *OPTIONS).refused()
+    assert history.read_bytes() == before
 
 
 def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_csv):
@@ -201,15 +154,13 @@ def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_
         'time,valve_opening,main_steam_pressure,main_steam_temperature,generated_power,'
         'Vacuum [kPa],temperature,Spare', mine,
     )  # fmt: skip
-    ran = run('import', table, '-o', tmp_path / 'without.mcap')
-    assert ran.status == 0, ran.err
+    ran = run('import', table, '-o', tmp_path / 'without.mcap').done()
     assert (
         'Of these Vacuum [kPa], temperature hold numbers; if the power may follow one of them, '
         "keep it with --covariate 'vacuum=Vacuum [kPa]'." in ran.out
     )
     log = tmp_path / 'x.mcap'
-    ran = run('import', table, '-o', log, '--covariate', 'vacuum=Vacuum', '--json')
-    assert ran.status == 0, ran.err
+    ran = run('import', table, '-o', log, '--covariate', 'vacuum=Vacuum', '--json').done()
     assert ran.json['ignored'] == ['temperature', 'Spare']
     (kept,) = ran.json['covariates']
     assert (kept['name'], kept['unit'], kept['low'], kept['high']) == ('vacuum', 'kPa', 5.0, 5.06)
@@ -224,25 +175,141 @@ def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_
 
 
 @pytest.mark.parametrize(
-    ('said', 'told'),
+    ('output', 'said', 'told'),
     [
-        ('vacuum=nothing', "--covariate vacuum: {table} has no column or topic 'nothing'"),
-        ('valve_command=Spare', "'valve_command' is the name of a signal; choose another name"),
-        ('gain_drift=Spare', 'is a cause of the catalogue already; choose another name'),
+        ('x.mcap', 'vacuum=nothing', "--covariate vacuum: {} has no column or topic 'nothing'"),
+        ('x.mcap', 'valve_command=Spare', "'valve_command' is the name of a signal; choose"),
+        ('x.mcap', 'gain_drift=Spare', 'is a cause of the catalogue already; choose another'),
+        ('x.csv', 'v=Spare', '--covariate needs a recording as output'),
     ],
 )
-def test_a_further_column_that_cannot_be_kept(run, tmp_path, history, said, told):
-    ran = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS, '--covariate', said)
+def test_a_further_column_that_cannot_be_kept(run, tmp_path, history, output, said, told):
+    ran = run('import', history, '-o', tmp_path / output, *OPTIONS, '--covariate', said)
     assert ran.status != 0
-    assert told.format(table=history) in ran.err
+    assert told.format(history) in ran.err
 
 
-def test_a_table_has_no_place_for_a_further_column(run, tmp_path, history):
-    ran = run('import', history, '-o', tmp_path / 'x.csv', *OPTIONS, '--covariate', 'v=Spare')
-    assert ran.status == 2
-    assert '--covariate needs a recording as output' in ran.err
+GERMAN = 'Zeitstempel;Ventilstellung;Frischdampfdruck;FD-Temperatur;Bruttoleistung;Drehzahl'
+N = 90
 
 
-def test_the_command_after_a_refusal_keeps_the_further_column(run, tmp_path, history):
-    ran = run('import', history, '-o', tmp_path / 'x.mcap', *OPTIONS[:-2], '--covariate', 'v=MW')
-    assert '--covariate v=MW' in ran.err
+def number(value):
+    return f'{value:.2f}'.replace('.', ',')
+
+
+def line_of(k):
+    numbers = map(number, (50 + k / 2, 130 + k, 538, 200 + k))
+    return ';'.join([f'22.11.2026 14:{k // 60:02}:{k % 60:02}', *numbers, '3000'])
+
+
+@pytest.fixture
+def german(tmp_path):
+    path = tmp_path / 'history.csv'
+    lines = ['Archiv Block 3', 'von;22.11.2026', '', GERMAN, ';%;bar;°C;MW;1/min',
+             *(line_of(k % 50) if k < 50 else line_of(k).replace(number(200 + k), 'I/O Timeout')
+               if k == 70 else line_of(k) for k in range(N))]  # fmt: skip
+    path.write_bytes('\r\n'.join(lines).encode('cp1252'))
+    return path
+
+
+def test_a_german_export_needs_no_option(run, german, tmp_path):
+    log = tmp_path / 'x.mcap'
+    ran = run('import', german, '-o', log).done()
+    k = np.arange(N)
+    assert np.allclose(values(log, Signal.MAIN_STEAM_PRESSURE), 13.0 + 0.1 * k)
+    power = values(log, Signal.GENERATED_POWER)
+    assert np.isnan(power[70])
+    assert np.allclose(np.delete(power, 70), 200.0 + np.delete(k, 70))
+    for word in ("'Zeitstempel'", 'the times name no zone', '--time-zone Europe/Berlin',
+                 'by its name', 'from bar', "1 'I/O Timeout'", 'Not used: Drehzahl.'):  # fmt: skip
+        assert word in ran.out
+    told = json.loads(open_log(log).attachments['import.json'])
+    assert told['signals'][1]['column'] == 'Frischdampfdruck'
+    assert told['signals'][3]['words'] == {'I/O Timeout': 1}
+    # A dry run shows the same and writes nothing.
+    log.unlink()
+    dry = run('import', german, '-o', log, '--dry-run').out.splitlines()
+    assert dry[:-1] == ran.out.splitlines()[:-1]
+    assert 'Nothing was written' in dry[-1]
+    assert not log.exists()
+    assert '-o LOG.mcap' in run('import', german).refused(2)
+    # Times are told in the zone that is named.
+    said = run('import', german, '-o', log, '--time-zone', 'Europe/Berlin').out
+    assert ' UTC,' not in said
+    assert 'CET' in said or 'CEST' in said
+    assert said.rstrip().endswith(
+        'add --time-zone Europe/Berlin to identify and diagnose to see local times.'
+    )
+
+
+def test_every_verb_reads_it_the_same(run, german, tmp_path):
+    ran = run('info', german, '--json')
+    assert ran.json['signals']['main_steam_pressure']['low'] == 13.0
+    assert "'Frischdampfdruck' is read as main_steam_pressure (by its name, in bar)" in ran.err
+    run('export', german, '-o', tmp_path / 'y.csv')
+    assert values(tmp_path / 'y.csv', Signal.VALVE_OPENING).tolist() == [
+        50 + k / 2 for k in range(N)
+    ]
+
+
+@pytest.mark.parametrize(
+    ('change', 'said', 'option', 'unused'),
+    [
+        ({b'Drehzahl': b'Nettoleistung', b'1/min': b'MW'},
+         "'Bruttoleistung' and 'Nettoleistung' could each be generated_power",
+         '--column generated_power=Bruttoleistung', 'Nettoleistung'),
+        ({b';%;bar': b';%;'}, "'Frischdampfdruck' reads like main_steam_pressure, but",
+         '--column main_steam_pressure=Frischdampfdruck:bar', 'Drehzahl'),
+    ],
+)  # fmt: skip
+def test_what_can_be_read_in_two_ways_is_refused_with_the_option(
+    run, german, tmp_path, change, said, option, unused
+):
+    text = german.read_bytes()
+    for old, new in change.items():
+        text = text.replace(old, new)
+    german.write_bytes(text)
+    sentence = run('import', german, '-o', tmp_path / 'x.mcap').refused()
+    assert said in sentence
+    assert option in sentence
+    ran = run('import', german, '-o', tmp_path / 'x.mcap', *option.split()).done()
+    assert f'Not used: {unused}.' in ran.out
+    assert not list(tmp_path.glob('*.draft*'))
+
+
+@pytest.mark.parametrize('order', ['as it stands', 'newest first', 'shuffled'])
+def test_blocks_and_order_change_nothing(run, german, tmp_path, monkeypatch, order):
+    run('import', german, '-o', tmp_path / 'whole.mcap')
+    lines = german.read_bytes().split(b'\r\n')
+    head, rows = lines[:5], lines[5:]
+    if order == 'newest first':
+        rows = rows[::-1]
+    elif order == 'shuffled':
+        rows = [rows[k] for k in np.random.default_rng(3).permutation(N)]
+    german.write_bytes(b'\r\n'.join([*head, *rows]))
+    monkeypatch.setattr(file, 'BLOCK_ROWS', 7)
+    monkeypatch.setattr(table_import, '_ROWS', 11)
+    (tmp_path / 'parts').mkdir()
+    ran = run('import', german, '-o', tmp_path / 'parts' / 'x.mcap').done()
+    assert ('sorted' in ran.err) == (order != 'as it stands')
+    one, two = open_log(tmp_path / 'whole.mcap'), open_log(tmp_path / 'parts' / 'x.mcap')
+    assert np.array_equal(one.readings.time_ns, two.readings.time_ns)
+    assert np.array_equal(one.readings.value, two.readings.value, equal_nan=True)
+    assert np.array_equal(one.readings.signal, two.readings.signal)
+    assert np.array_equal(one.log_time_ns, two.log_time_ns)
+
+
+def test_a_row_for_each_value_becomes_a_log(run, tmp_path):
+    lines = ['Tag,Timestamp,Value']
+    for k in range(30):
+        for tag, value, second in (('CV_POS', 50 + k, 0), ('MS_PRESS_MPa', 13, 3), ('MW', 200, 7)):
+            lines.append(f'{tag},2026-11-22 14:{k:02}:{second:02},{value}')
+    table = tmp_path / 'long.csv'
+    table.write_text('\n'.join(lines))
+    constant = ('--constant', 'main_steam_temperature=540')
+    run('import', table, '-o', tmp_path / 'x.mcap', *constant).done()
+    readings = open_log(tmp_path / 'x.mcap').readings
+    assert [int((readings.signal == s).sum()) for s in Signal] == [30, 30, 30, 30, 0]
+    assert np.isfinite(readings.value).all()
+    sentence = run('import', table, '-o', tmp_path / 'x.csv', *constant).refused()
+    assert 'write an .mcap file' in sentence

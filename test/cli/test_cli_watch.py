@@ -1,11 +1,13 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow watch``: the verb around the terminal view."""
+"""``valveflow watch``: the verb around the terminal view and the page."""
 
 from __future__ import annotations
 
 import os
+import pty
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -14,7 +16,7 @@ import time
 import urllib.request
 
 import pytest
-from monitor_recording import recording
+from monitor_recording import Monitor, alarm, curve, diagnosis, recording
 
 from valveflow_ros.cli.verbs import watch as verb
 
@@ -64,21 +66,27 @@ def test_without_ros_it_says_so_and_what_else_there_is(run, monkeypatch):
     assert 'valveflow watch valveflow_recordings' in sentence
 
 
-def test_with_ros_another_process_takes_over(run, monkeypatch):
-    taken = []
-    monkeypatch.setattr(verb, 'find_spec', lambda name: name)
-    monkeypatch.setattr(os, 'execv', lambda path, words: taken.append(words) or _end())
-
-    def _end():
+@pytest.mark.parametrize(('words', 'module', 'handed_on'), [
+    (['--once', '--node', '/a/b'], 'watch_main',
+     ['--interval', '1.0', '--once', '--node', '/a/b', '--time-zone=']),
+    (['--ask', 'shelve_alarms', '--alarm', 'residual', '--time-zone=-05:00'], 'watch_main',
+     ['--interval', '1.0', '--ask', 'shelve_alarms', '--alarm', 'residual',
+      '--time-zone=-05:00']),
+    (['--page', '--node', '/a/b', '--webhook', 'http://a/', '--name', 'plant'], 'page_main',
+     ['--host', '127.0.0.1', '--port', '8350', '--name', 'plant', '--node', '/a/b',
+      '--webhook', 'http://a/', '--time-zone=']),
+])  # fmt: skip
+def test_with_ros_another_process_takes_over(run, monkeypatch, words, module, handed_on):
+    def become(path, given):
+        taken.append(given)
         raise KeyboardInterrupt
 
-    run('watch', '--once', '--node', '/a/b')
-    assert taken[0][1:3] == ['-m', 'valveflow_ros.ros.watch_main']
-    assert taken[0][3:] == ['--interval', '1.0', '--once', '--node', '/a/b', '--time-zone=']
-    run('watch', '--ask', 'shelve_alarms', '--alarm', 'residual', '--time-zone=-05:00')
-    assert taken[1][5:] == [
-        '--ask', 'shelve_alarms', '--alarm', 'residual', '--time-zone=-05:00',
-    ]  # fmt: skip
+    taken = []
+    monkeypatch.setattr(verb, 'find_spec', lambda name: name)
+    monkeypatch.setattr(verb, 'check_installed', lambda: None)
+    monkeypatch.setattr(os, 'execv', become)
+    run('watch', *words)
+    assert taken[0][1:] == ['-m', f'valveflow_ros.ros.{module}', *handed_on]
 
 
 def test_a_recording_on_a_page(tmp_path):
@@ -134,18 +142,98 @@ def test_without_its_libraries_the_page_is_told_of(run, monkeypatch, tmp_path):
     assert 'pip install dash prometheus_client waitress' in sentence
 
 
-def test_the_page_of_a_running_monitor_is_another_process(run, monkeypatch):
-    taken = []
-    monkeypatch.setattr(verb, 'find_spec', lambda name: name)
-    monkeypatch.setattr(verb, 'check_installed', lambda: None)
-    monkeypatch.setattr(os, 'execv', lambda path, words: taken.append(words) or _end())
+class Terminal:
+    """A process on a terminal of its own."""
 
-    def _end():
-        raise KeyboardInterrupt
+    def __init__(self, *words: str, **environment: str) -> None:
+        self.text = ''
+        self._master, slave = pty.openpty()
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'valveflow_ros.cli', *words], stdin=slave, stdout=slave,
+            stderr=slave, start_new_session=True,
+            env={**os.environ, 'COLUMNS': '90', 'LINES': '26', 'TERM': 'xterm', **environment},
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )  # fmt: skip
+        os.close(slave)
 
-    run('watch', '--page', '--node', '/a/b', '--webhook', 'http://a/', '--name', 'plant')
-    assert taken[0][1:3] == ['-m', 'valveflow_ros.ros.page_main']
-    assert taken[0][3:] == [
-        '--host', '127.0.0.1', '--port', '8350', '--time-zone=', '--name', 'plant',
-        '--node', '/a/b', '--webhook', 'http://a/',
-    ]  # fmt: skip
+    def until(self, part: str, patience_s: float = 60.0) -> str:
+        end_s = time.monotonic() + patience_s
+        while part not in self.last():
+            assert time.monotonic() < end_s, f'{part!r} did not come: {self.text[-2000:]!r}'
+            self._take()
+        return self.last()
+
+    def last(self) -> str:
+        """Return what was drawn last, without colours."""
+        frame = self.text.rsplit('\x1b[H', 1)[-1]
+        return re.sub(r'\r\n +', ' ', re.sub(r'\x1b\[[0-9;]*[A-Za-z]', '', frame))
+
+    def end(self, number: int) -> int:
+        self.process.send_signal(number)
+        try:
+            while self.process.poll() is None or select.select([self._master], [], [], 0)[0]:
+                self._take()
+        except OSError:
+            pass
+        os.close(self._master)
+        return self.process.wait(timeout=30)
+
+    def _take(self) -> None:
+        if select.select([self._master], [], [], 0.1)[0]:
+            self.text += os.read(self._master, 65536).decode(errors='replace')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_what_happens_is_seen_until_ctrl_c(tmp_path, number):
+    monitor = Monitor(tmp_path / 'r')
+    monitor.say('characteristic', curve(monitor.now_ns))
+    monitor.seconds(5)
+    terminal = Terminal('watch', str(tmp_path / 'r'), '--interval', '0.1')
+    terminal.until('recording, r_0.mcap')
+    assert '\x1b[?1049h' in terminal.text
+    monitor.writer.rotate()
+    monitor.say('alarms', alarm(monitor.now_ns, 1, 'The unit gives less.'))
+    monitor.seconds(5, residual=-6.0)
+    shown = terminal.until('ALARM, not acknowledged')
+    assert 'r_1.mcap' in shown
+    assert '−6.0 MW' in shown
+    monitor.writer.close()
+    terminal.until('finished, r_1.mcap')
+    assert terminal.end(number) == 0
+    # The terminal is as it was, and nothing was said.
+    assert terminal.text.endswith('\x1b[?25h\x1b[?1049l')
+    assert 'Traceback' not in terminal.text
+
+
+@pytest.mark.parametrize(('name', 'value'), [('NO_COLOR', '1'), ('TERM', 'dumb')])
+def test_plain_terminals(tmp_path, name, value):
+    terminal = Terminal(
+        'watch', str(recording(tmp_path / 'r')), '--interval', '0.1', **{name: value}
+    )
+    terminal.until('ALARM, not acknowledged')
+    # Line by line, a finished recording has an end of its own.
+    terminal.end(signal.SIGINT if name == 'NO_COLOR' else 0)
+    assert terminal.process.returncode == 0
+    assert not re.search(r'\x1b\[[0-9;]*m', terminal.text)
+    assert ('\x1b' in terminal.text) == (name == 'NO_COLOR')
+
+
+def test_lines_to_a_pipe_come_as_it_happens(tmp_path):
+    monitor = Monitor(tmp_path / 'r')
+    monitor.seconds(2)
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'valveflow_ros.cli', 'watch', str(tmp_path / 'r')],
+        stdout=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert process.stdout is not None
+    while 'recorder: recording' not in process.stdout.readline():
+        assert process.poll() is None
+    monitor.say('diagnosis', diagnosis(monitor.now_ns, 1, 'All is well.'))
+    monitor.seconds(1)
+    line = process.stdout.readline()
+    assert 'diagnosis: no cause found' in line
+    assert 'All is well.' in line
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30) == 0
+    process.stdout.close()

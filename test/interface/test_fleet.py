@@ -51,11 +51,30 @@ def client():
         yield client
 
 
+class Told(Progress):
+    def __init__(self):
+        self.all = []
+
+    def __call__(self, share, what):
+        self.all.append((share, what))
+
+    def say(self, sentence):
+        self.all.append(sentence)
+
+
 @pytest.fixture(scope='module')
 def ran(plants, client, tmp_path_factory):
-    out = tmp_path_factory.mktemp('out')
+    out, told = tmp_path_factory.mktemp('out'), Told()
     address = client.scheduler.address
-    return vf.fleet([plants], out, scheduler=address, options=WORDS)
+    found = vf.fleet([plants], out, scheduler=address, options=WORDS, progress=told)
+    # What is under way is told before the first log is done.
+    bounded, begins, first, *_, last = told.all
+    assert 'bounded to' in bounded
+    assert 'compiles first' in begins
+    assert first[0] == 0.0
+    assert first[1].startswith('first 007 2026-9')
+    assert last[0] == 1.0
+    return found
 
 
 def files(folder):
@@ -105,25 +124,6 @@ def test_the_data_set_has_a_row_for_each_log_with_what_the_files_say(ran):
     assert row.verdict == verdict
     assert row.versions['valveflow'] == vf.__version__
     assert 0.0 < row.monitor_s < row.task_s
-
-
-def test_what_is_under_way_is_told_before_the_first_log_is_done(ran, plants, client):
-    told = []
-
-    class Told(Progress):
-        def __call__(self, share, what):
-            told.append((share, what))
-
-        def say(self, sentence):
-            told.append(sentence)
-
-    address = client.scheduler.address
-    vf.fleet([plants / '007'], ran.folder, scheduler=address, options=WORDS, progress=Told())
-    bounded, begins, *rest = told
-    assert 'bounded to' in bounded
-    assert 'compiles first' in begins
-    assert rest == [(0.0, 'first 007 2026-9'), (0.5, '007 2026-9 done'), (1.0, '007 2026-10 done')]
-    vf.fleet([plants], ran.folder, scheduler=address, options=WORDS)  # the data set is of both
 
 
 def test_a_broken_log_costs_one_row_with_a_sentence(ran):

@@ -18,15 +18,36 @@ from extended_file import write_extended
 from streams import needs_jit
 
 import valveflow_ros as vf
+from valveflow_ros.cli.main import main
 from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
 from valveflow_ros.interface.monitor import MonitorResult
+from valveflow_ros.interface.observation import settings_for
 from valveflow_ros.logs import write_samples, write_table
+from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.offline import align_all, feed_aligned
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.report.words import moment, percent
+from valveflow_ros.signals.align import Aligner
 
 QUICK = {'refine': False, 'selection_rule': 'paper'}
+
+
 HEAVY = {'numpy', 'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'yaml'}
+
+
+class Heard(vf.Progress):
+    """What was told, in its order."""
+
+    def __init__(self):
+        self.shares, self.words, self.said = [], [], []
+
+    def __call__(self, share, what):
+        self.shares.append(share)
+        self.words.append(what)
+
+    def say(self, sentence):
+        self.said.append(sentence)
 
 
 @pytest.fixture(scope='module')
@@ -97,21 +118,19 @@ class TestLog:
         )
         assert back['main_steam_temperature_degc'].tolist() == pytest.approx([540.0] * 100)
 
-    def test_doubtful_values_keep_their_mark(self, simulation):
-        frame = simulation.to_dataframe().head(50)
-        frame['valve_opening_percent_quality'] = np.uint8([0, 1] * 25)
-        back = vf.open_log(frame).to_dataframe()
-        assert back['valve_opening_percent_quality'].tolist() == [0, 1] * 25
-
     def test_a_file_and_its_dataframe_are_the_same_log(self, simulation, tmp_path):
         write_table(simulation.data.table.part(0, 1000), tmp_path / 'a.parquet')
-        file = vf.open_log(tmp_path / 'a.parquet')
-        frame = vf.open_log(pd.read_parquet(tmp_path / 'a.parquet'))
+        frame = pd.read_parquet(tmp_path / 'a.parquet')
+        frame['valve_opening_percent_quality'] = np.uint8([0, 1] * 500)  # keeps its mark
+        frame.to_parquet(tmp_path / 'a.parquet')
+        file, there = vf.open_log(tmp_path / 'a.parquet'), vf.open_log(frame)
         for name in ('time_ns', 'signal', 'value', 'quality'):
             np.testing.assert_array_equal(
-                getattr(file.readings, name), getattr(frame.readings, name)
+                getattr(file.readings, name), getattr(there.readings, name)
             )
-        assert (file.name, frame.name) == ('a.parquet', 'DataFrame')
+        assert (file.name, there.name) == ('a.parquet', 'DataFrame')
+        marks = there.to_dataframe()['valve_opening_percent_quality']
+        assert marks.tolist() == [0, 1] * 500
 
     @pytest.mark.parametrize(
         ('change', 'options', 'error', 'part'),
@@ -142,20 +161,20 @@ class TestLog:
 
 @needs_jit
 class TestIdentify:
-    def test_it_is_the_verb(self, identified, simulation, tmp_path):
-        from valveflow_ros.cli.main import main
-
+    def test_it_is_the_verb(self, simulation, tmp_path):
         log = str(simulation.write(tmp_path / 'plant.parquet'))
-        assert main(['identify', log, '-o', str(tmp_path / 'verb'), '--quiet']) == 0
-        done = vf.identify(log).write(tmp_path / 'call')
+        pairs = [word for k, v in QUICK.items() for word in ('--set', f'{k}={str(v).lower()}')]
+        assert main(['identify', log, '-o', str(tmp_path / 'verb'), '--quiet', *pairs]) == 0
+        found = vf.identify(log, parameters=QUICK)
+        done = found.write(tmp_path / 'call')
         for name in ('characteristic.json', 'report.html'):
             assert (tmp_path / 'call' / name).read_text() == (tmp_path / 'verb' / name).read_text()
         assert done.files['report.html'] == tmp_path / 'call' / 'report.html'
         told = json.loads((tmp_path / 'call' / 'characteristic.json').read_text())
-        assert told == identified.to_json()
+        assert told == found.to_json()
         read = vf.load_characteristic(tmp_path / 'call')
-        assert read.model_id == identified.characteristic.model_id
-        assert read.pieces == identified.characteristic.pieces
+        assert read.model_id == found.characteristic.model_id
+        assert read.pieces == found.characteristic.pieces
 
     def test_a_picture_is_a_plotly_figure(self, identified):
         figure = identified.plot()
@@ -165,43 +184,27 @@ class TestIdentify:
         with pytest.raises(InputError, match="no picture 'nothing'; it has: curve"):
             identified.plot('nothing')
 
-    @pytest.mark.parametrize('step', [0.0, -0.02])
-    def test_a_curve_of_before_and_after_a_change_is_told_to_be_a_mixture(self, step):
+    def test_a_curve_of_before_and_after_a_change_is_told_to_be_a_mixture(self):
         # Means over a minute; the thermal unit shares no formula with the curve.
-        effects = [f'gain_step:g={step},t0_days=3'] if step else []
-        record = vf.simulate(6.0, 7, effects, unit='choked:number=451', recording='minute')
+        step = 'gain_step:g=-0.02,t0_days=3'
+        record = vf.simulate(6.0, 7, [step], unit='choked:number=451', recording='minute')
         told = [n for n in vf.identify(record.log).notes if 'mixture of before and after' in n]
-        assert len(told) == bool(step)
-        for sentence in told:
-            onset = re.search(r'since about (\S+ \S+) UTC it gives ([\d.]+) MW less', sentence)
-            away = pd.Timestamp(onset[1], tz='UTC') - (record.to_dataframe()['time'][0])
-            assert abs(away - pd.Timedelta(days=3)) < pd.Timedelta(hours=6)
-            assert 2.0 < float(onset[2]) < 9.0  # 2 % of 130 to 330 MW, and days of weather
+        (sentence,) = told
+        onset = re.search(r'since about (\S+ \S+) UTC it gives ([\d.]+) MW less', sentence)
+        away = pd.Timestamp(onset[1], tz='UTC') - (record.to_dataframe()['time'][0])
+        assert abs(away - pd.Timedelta(days=3)) < pd.Timedelta(hours=6)
+        assert 2.0 < float(onset[2]) < 9.0  # 2 % of 130 to 330 MW, and days of weather
 
-    def test_options_of_the_verb(self, log, identified, tmp_path):
-        identified.write(tmp_path)
-        again = vf.identify(log, parameters=QUICK, reference=tmp_path)
-        assert again.data.shift is not None
-        assert 'shift.json' in again.texts()
-        assert again.characteristic.dynamics == ()
-        with pytest.raises(InputError, match="did you mean 'time_constant'"):
-            vf.identify(log, parameters={'time_constnt': 3})
-        with pytest.raises(DataError, match='no step test'):
-            vf.identify(log, step_test=True)
-        with pytest.raises(UsageError, match='do not go together'):
-            vf.identify(log, step_test=True, model='x.json')
+    @pytest.mark.parametrize(('options', 'error', 'said'), [
+        ({'parameters': {'time_constnt': 3}}, InputError, "did you mean 'time_constant'"),
+        ({'step_test': True}, DataError, 'no step test'),
+        ({'step_test': True, 'model': 'x.json'}, UsageError, 'do not go together'),
+    ])  # fmt: skip
+    def test_what_does_not_go_is_refused(self, log, options, error, said):
+        with pytest.raises(error, match=said):
+            vf.identify(log, **options)
 
     def test_progress_and_messages_are_heard(self, simulation):
-        class Heard(vf.Progress):
-            def __init__(self):
-                self.shares, self.said = [], []
-
-            def __call__(self, share, what):
-                self.shares.append(share)
-
-            def say(self, sentence):
-                self.said.append(sentence)
-
         heard = Heard()
         frame = simulation.to_dataframe()[::10]
         found = vf.identify(frame, parameters=QUICK, progress=heard)
@@ -228,8 +231,6 @@ class TestIdentify:
         assert (tmp_path / 'report.html').is_file()
 
     def test_that_plotly_is_missing_is_told_before_any_work(self, tmp_path, monkeypatch, capsys):
-        from valveflow_ros.cli.main import main
-
         (tmp_path / 'log.mcap').write_bytes(b'cannot even be read')
         monkeypatch.setattr('valveflow_ros.report.page.find_spec', lambda name: None)
         assert main(['identify', str(tmp_path / 'log.mcap'), '-o', str(tmp_path / 'o')]) == 1
@@ -238,50 +239,18 @@ class TestIdentify:
 
 
 @needs_jit
-class TestJudged:
-    def test_a_curve_is_held_against_other_days(self, log, identified, tmp_path):
-        found = vf.validate(log, identified.characteristic, parameters=QUICK)
-        assert found.to_json()['model'] == identified.characteristic.model_id
-        assert found.validation.overall.segments > 5
-        assert len(found.plot().data) > 0
-        names = set(found.write(tmp_path).files)
-        assert names == {'validation.json', 'segments.csv', 'report.html'}
-        written = json.loads((tmp_path / 'validation.json').read_text())
-        assert written == found.to_json()
-        with pytest.raises(UsageError, match='The model is a curve over V p'):
-            vf.validate(log, identified.characteristic, parameters={'pressure_exponent': 1.0})
-
-    def test_three_methods_are_compared(self, log, simulation, tmp_path):
-        truth = tmp_path / 'truth.json'
-        truth.write_text(json.dumps(simulation.to_json()))
-        found = vf.compare(log, test=log, truth=truth, parameters=QUICK)
-        content = found.to_json()
-        assert set(content['methods']) == {'paper', 'proposed', 'hammerstein', 'sparse'}
-        assert content['held_out'] is False
-        assert content['errors_against_truth']['proposed']['rmse_mw'] < 10.0
-        assert {f.name for f in found.page().figures} >= {'curves', 'truth'}
-
-    def test_a_log_without_readings_is_refused(self, log):
-        empty = vf.open_log(log.to_dataframe().head(1))
-        with pytest.raises(DataError, match='DataFrame'):
-            vf.compare(empty)
-
-
-@needs_jit
-def test_a_diagnosis_names_extends_and_writes(tmp_path):
-    spiky = vf.simulate(1.3, 2, effects=['spikes:height=60,per_day=60']).log
-    found = vf.diagnose(spiky)
-    content = found.to_json()
-    assert (content['verdict'], [c['name'] for c in content['causes']]) == ('named', ['spikes'])
-    assert found.diagnosis.rmse_extended <= found.diagnosis.rmse_simulation
-    assert found.extended_model.pressure_exponent == 1.125
+def test_a_curve_is_held_against_other_days(log, identified, tmp_path):
+    found = vf.validate(log, identified.characteristic, parameters=QUICK)
+    assert found.to_json()['model'] == identified.characteristic.model_id
+    assert found.validation.overall.segments > 5
     assert len(found.plot().data) > 0
-    assert set(found.write(tmp_path).files) == {
-        'diagnosis.json', 'extended_model.json', 'report.html',
-    }  # fmt: skip
-    assert json.loads((tmp_path / 'diagnosis.json').read_text()) == content
-    # An identification on top of the model hands its causes on.
-    assert 'extended_model.json' in vf.identify(spiky, model=tmp_path).texts()
+    names = set(found.write(tmp_path).files)
+    assert names == {'validation.json', 'segments.csv', 'report.html'}
+    assert json.loads((tmp_path / 'validation.json').read_text()) == found.to_json()
+    with pytest.raises(UsageError, match='The model is a curve over V p'):
+        vf.validate(log, identified.characteristic, parameters={'pressure_exponent': 1.0})
+    with pytest.raises(DataError, match='DataFrame'):
+        vf.compare(vf.open_log(log.to_dataframe().head(1)))
 
 
 @needs_jit
@@ -289,13 +258,6 @@ class TestMonitor:
     @pytest.fixture(scope='class')
     @classmethod
     def heard(cls):
-        class Heard(vf.Progress):
-            def __init__(self):
-                self.told = []
-
-            def __call__(self, share, what):
-                self.told.append((share, what))
-
         return Heard()
 
     @pytest.fixture(scope='class')
@@ -325,17 +287,15 @@ class TestMonitor:
         assert 'turbine' not in said
 
     def test_progress_follows_the_rows_and_names_each_fit_and_diagnosis(self, told, heard):
-        shares = [share for share, _ in heard.told]
-        assert shares == sorted(shares)
-        assert max(np.diff(shares)) < 0.3
-        assert shares[-1] == pytest.approx(0.95)
-        words = [what for _, what in heard.told]
+        assert heard.shares == sorted(heard.shares)
+        assert max(np.diff(heard.shares)) < 0.3
+        assert heard.shares[-1] == pytest.approx(0.95)
         (at, _), first = told.diagnoses[0], told.curves[0][0]
-        assert f'diagnosis 1, data up to {minute(at)}' in words
-        fits = [what for what in words if what.startswith('fit ')]
+        assert f'diagnosis 1, data up to {minute(at)}' in heard.words
+        fits = [what for what in heard.words if what.startswith('fit ')]
         assert len(fits) >= len(told.curves)
         assert f'data up to {minute(first)}' in ' '.join(fits)
-        assert words[-1].startswith('monitoring, data up to ')
+        assert heard.words[-1].startswith('monitoring, data up to ')
 
     def test_curves_alarms_and_predictions(self, told):
         content = told.to_json()
@@ -400,11 +360,6 @@ class TestMonitor:
         assert 'but not for alarm_on_delay (15 min).' in without.evidence_words
 
     def test_it_says_what_the_engine_fed_in_one_go_says(self, log):
-        from valveflow_ros.interface.observation import settings_for
-        from valveflow_ros.monitoring.monitor import Monitor
-        from valveflow_ros.monitoring.offline import align_all, feed_aligned
-        from valveflow_ros.signals.align import Aligner
-
         given = {**QUICK, 'refit_segments': 8, 'diagnosis_hour': -1}
         settings, _ = settings_for(log.steps(), 0.0, given, live=True)
         engine, events = Monitor(settings), []
@@ -450,8 +405,10 @@ def test_a_simulation_is_written_with_its_truth(tmp_path):
 
 
 class TestOtherUnits:
-    @pytest.mark.parametrize('name', ['a.csv', 'a.parquet', 'a.mcap'])
-    @pytest.mark.parametrize('kept', ['1s', 'minute', 'compressed:resample_s=5'])
+    @pytest.mark.parametrize(
+        ('name', 'kept'),
+        [('a.csv', '1s'), ('a.parquet', 'compressed:resample_s=5'), ('a.mcap', 'minute')],
+    )
     def test_what_is_written_is_what_was_kept(self, tmp_path, name, kept):
         plant = vf.simulate(0.05, 3, unit='sequence', recording=kept)
         plant.write(tmp_path / name, truth=tmp_path / 't.json')
@@ -542,24 +499,17 @@ class TestOtherUnits:
             vf.simulate(0.01, 1, **given)
 
 
-def recording(path, parameters):
+def test_the_units_are_those_the_monitor_was_told_if_they_are_units(tmp_path):
     table = vf.simulate(0.01, 1).data.table
     values = table.values.copy()
     values[:, Signal.MAIN_STEAM_PRESSURE] *= 10.0
     sent = SampleTable(table.time_ns, values, table.quality)
-    attached = {'parameters.json': json.dumps(parameters).encode()}
-    write_samples(sent, path, attachments=attached)
-    return vf.open_log(path)
-
-
-def test_the_units_are_those_the_monitor_was_told(tmp_path):
-    log = recording(tmp_path / 'a.mcap', {'main_steam_pressure_unit': 'bar'})
-    assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'bar'
-    mine = log.readings.value[log.readings.signal == Signal.MAIN_STEAM_PRESSURE]
-    assert 5.0 < mine.min() < mine.max() < 20.0
-
-
-def test_words_that_are_no_units_are_not_believed(tmp_path):
-    for k, parameters in enumerate(({'main_steam_pressure_unit': 'ell'}, {}, [1])):
-        log = recording(tmp_path / f'x_{k}' / 'a.mcap', parameters)
-        assert log.units[Signal.MAIN_STEAM_PRESSURE] == 'MPa'
+    told = {'bar': 'bar', 'ell': 'MPa', None: 'MPa', 'no parameters': 'MPa'}
+    for k, (unit, expected) in enumerate(told.items()):
+        parameters = [1] if unit == 'no parameters' else {'main_steam_pressure_unit': unit}
+        path = tmp_path / f'{k}' / 'a.mcap'
+        write_samples(sent, path, attachments={'parameters.json': json.dumps(parameters).encode()})
+        log = vf.open_log(path)
+        assert log.units[Signal.MAIN_STEAM_PRESSURE] == expected
+        mine = log.readings.value[log.readings.signal == Signal.MAIN_STEAM_PRESSURE]
+        assert (mine.max() < 20.0) == (expected == 'bar')

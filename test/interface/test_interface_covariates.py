@@ -21,6 +21,11 @@ from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.signals.covariates import entry
 
 COLUMN = 'condenser_pressure_kpa'
+# The monitor diagnoses twice: after the first day, and one day later.
+NIGHTLY = {
+    'reference_after': 0.0, 'diagnosis_on_mismatch': False, 'refit_period': 86400.0,
+    'refit_segments': 0,
+}  # fmt: skip
 
 
 @pytest.fixture(scope='module')
@@ -29,16 +34,15 @@ def plant():
 
 
 @pytest.fixture(scope='module')
-def sound():
-    unit = 'choked:number=3,vacuum_per_kpa=0'
-    return vf.simulate(days=5, seed=3, unit=unit, recording='minute')
-
-
-@pytest.fixture(scope='module')
 def diagnosed(plant, tmp_path_factory):
+    """Diagnose with the column that matters, an unrelated one and a constant."""
+    frame = plant.to_dataframe()
+    frame['reversed'] = frame[COLUMN].to_numpy()[::-1]
+    frame['constant'] = 7.0
     path = tmp_path_factory.mktemp('covariate') / 'plant.parquet'
-    plant.write(path)
-    return vf.diagnose(path, covariates={'vacuum': COLUMN})
+    frame.to_parquet(path)
+    said = {'vacuum': COLUMN, 'weather': 'reversed', 'number': 'constant'}
+    return vf.diagnose(path, covariates=said)
 
 
 @pytest.fixture(scope='module')
@@ -53,6 +57,8 @@ def truth(plant):
 @needs_jit
 def test_the_vacuum_is_named_with_its_size(plant, diagnosed, without):
     d = diagnosed.diagnosis
+    assert not {'weather', 'number'} & {c.name for c in d.causes}
+    assert dict(d.rejected)['number'].startswith('cannot be judged: constant hardly changes')
     assert any(n.startswith('Curve and alarms can leave out vacuum: give') for n in d.notes)
     (found,) = (c for c in d.causes if c.name == 'vacuum')
     b = found.parameters['b']
@@ -142,18 +148,11 @@ def test_a_curve_and_a_monitor_without_the_weather(plant, diagnosed, tmp_path):
     rmse = [r.characteristic.residuals.rmse_mw for r in (plain, freed)]
     assert rmse[1] < 0.75 * rmse[0]
     assert [h.name for h in freed.characteristic.held] == list(model.model.names)
-    told = vf.monitor(path, model=model, diagnose=False)
+    told = vf.monitor(path, model=model, diagnose=False, parameters=NIGHTLY)
     assert told.curves[-1][1].residuals.rmse_mw < 0.75 * rmse[0]
     without = plant.to_dataframe().drop(columns=COLUMN)
     with pytest.raises(InputError, match=f"has no column or topic '{COLUMN}"):
         vf.identify(without, model=model)
-
-
-def test_a_parameter_file_of_the_node_names_them_too(plant):
-    given = {'covariates': 'vacuum=/nowhere'}
-    for verb in (vf.diagnose, vf.monitor):
-        with pytest.raises(InputError, match=r"covariate vacuum: .* has no column or topic '/now"):
-            verb(plant.to_dataframe(), parameters=given)
 
 
 @needs_jit
@@ -175,21 +174,13 @@ def test_without_the_column_a_drift_is_told(plant, without):
 
 
 @needs_jit
-def test_nothing_drifts_where_the_power_does_not_follow(sound):
+def test_nothing_drifts_where_the_power_does_not_follow():
+    unit = 'choked:number=3,vacuum_per_kpa=0'
+    sound = vf.simulate(days=5, seed=3, unit=unit, recording='minute')
     d = vf.diagnose(sound.to_dataframe(), covariates={'vacuum': COLUMN}).diagnosis
     assert 'vacuum' not in {c.name for c in d.causes}
     assert 'slow wander' in dict(d.rejected)['vacuum']
     assert d.disturbance is None or d.disturbance.drift_mw is None
-
-
-@needs_jit
-def test_an_unrelated_column_and_a_constant_are_not_named(plant):
-    frame = plant.to_dataframe()
-    frame['reversed'] = frame[COLUMN].to_numpy()[::-1]
-    frame['constant'] = 7.0
-    d = vf.diagnose(frame, covariates={'weather': 'reversed', 'number': 'constant'}).diagnosis
-    assert not {'weather', 'number'} & {c.name for c in d.causes}
-    assert dict(d.rejected)['number'].startswith('cannot be judged: constant hardly changes')
 
 
 @pytest.mark.parametrize(
@@ -214,24 +205,14 @@ def test_it_is_the_same_from_a_file(plant, tmp_path, kind):
     np.testing.assert_array_equal(from_file.values, from_frame.values)
 
 
-# The monitor diagnoses twice: after the first day, and one day later.
-NIGHTLY = {
-    'reference_after': 0.0, 'diagnosis_on_mismatch': False, 'refit_period': 86400.0,
-    'refit_segments': 0,
-}  # fmt: skip
-
-
-def monitored(plant, covariates):
-    """Return the last diagnosis of a monitor over two and a half days."""
-    frame = plant.to_dataframe().head(3600)
-    few = frame[COLUMN].where(np.arange(len(frame)) < 600)
-    result = vf.monitor(frame.assign(few=few), parameters=NIGHTLY, covariates=covariates)
-    return result.diagnoses[-1][1]
-
-
 @needs_jit
 def test_the_monitor_names_it_with_its_size(plant):
-    found = monitored(plant, {'vacuum': COLUMN, 'short': 'few'})
+    """The last diagnosis over two and a half days; a column of a few hours is left out."""
+    frame = plant.to_dataframe().head(3600)
+    few = frame[COLUMN].where(np.arange(len(frame)) < 600)
+    said = {'vacuum': COLUMN, 'short': 'few'}
+    result = vf.monitor(frame.assign(few=few), parameters=NIGHTLY, covariates=said)
+    found = result.diagnoses[-1][1]
     (cause,) = found['causes']
     b = cause['parameters']['b']
     assert (cause['name'], b['unit']) == ('vacuum', 'MW/kPa')
@@ -240,11 +221,6 @@ def test_the_monitor_names_it_with_its_size(plant):
     (note,) = (note for note in found['notes'] if 'few' in note)
     assert note.startswith("'few' has values for only ")
     assert note.endswith('half of them are needed. short was left out.')
-
-
-@needs_jit
-def test_without_the_column_the_monitor_does_not_name_it(plant):
-    assert 'vacuum' not in {cause['name'] for cause in monitored(plant, None)['causes']}
 
 
 def test_series_are_bridged_but_not_over_gaps():
@@ -276,7 +252,7 @@ def test_what_is_no_covariate_is_refused(plant, said, sentence):
             vf.monitor(frame, covariates=said)
 
 
-def test_the_parameter_is_used_where_no_covariate_is_given(plant):
-    given = {'covariates': 'vacuum=nowhere'}
-    with pytest.raises(InputError, match='--covariate vacuum: DataFrame has no column'):
-        vf.monitor(plant.to_dataframe().head(1500), parameters=given)
+def test_the_parameter_names_them_too(plant):
+    for verb in (vf.diagnose, vf.monitor):
+        with pytest.raises(InputError, match=r"covariate vacuum: .* has no column or topic '/now"):
+            verb(plant.to_dataframe(), parameters={'covariates': 'vacuum=/nowhere'})

@@ -1,17 +1,19 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Mapping options, parameters, and the settings that follow from the data."""
+"""Mapping options, parameters, and the settings that follow from the data; plausible values."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from valveflow_ros.errors import InputError, RecordingError, UsageError
 from valveflow_ros.interface.mapping import read_mapping
+from valveflow_ros.interface.plausibility import doubt
 from valveflow_ros.interface.settings import (
     fitting,
     read_parameters,
@@ -73,65 +75,41 @@ def test_wrong_mappings_are_refused(columns, constants, part):
 
 
 @pytest.mark.parametrize(
-    ('pair', 'part'),
+    ('text', 'pair', 'error', 'parts'),
     [
-        ('time_constant', 'NAME=VALUE'),
-        ('=5', 'NAME=VALUE'),
-        ('time_constnt=5', "did you mean 'time_constant'"),
-        ('time_constant=fast', 'must be a number'),
-        ('time_constant=nan', 'must be from'),
-        ('time_constant=-1', 'must be from'),
-        ('max_pieces=2.5', 'whole number'),
-        ('refine=perhaps', 'true or false'),
-        ('main_steam_pressure_unit=stone', 'must be one of'),
+        ('', 'time_constant', UsageError, ['NAME=VALUE']),
+        ('', '=5', UsageError, ['NAME=VALUE']),
+        ('', 'time_constnt=5', UsageError, ["did you mean 'time_constant'"]),
+        ('', 'time_constant=fast', UsageError, ['must be a number']),
+        ('', 'time_constant=nan', UsageError, ['must be from']),
+        ('', 'time_constant=-1', UsageError, ['must be from']),
+        ('', 'max_pieces=2.5', UsageError, ['whole number']),
+        ('', 'refine=perhaps', UsageError, ['true or false']),
+        ('', 'main_steam_pressure_unit=stone', UsageError, ['must be one of']),
+        ('a: [1', 'delay=1', InputError, ['no YAML', 'p.yaml']),
+        ('- 1\n- 2\n', 'delay=1', InputError, ['names and values', 'p.yaml']),
+        ('/**:\n  ros__parameters:\n    time_constnt: 1.0\n', 'delay=1', InputError,
+         ['did you mean', 'p.yaml']),
+        (None, 'delay=1', RecordingError, ['no such file', 'p.yaml']),
     ],
-)
-def test_wrong_parameters_are_refused(pair, part):
-    with pytest.raises(UsageError) as refused:
-        read_parameters(None, [pair])
-    assert part in str(refused.value)
+)  # fmt: skip
+def test_wrong_parameters_are_refused(tmp_path, text, pair, error, parts):
+    file = tmp_path / 'p.yaml'
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(error) as refused:
+        read_parameters(file, [pair])
+    assert all(part in str(refused.value) for part in parts)
 
 
-def test_set_stands_above_the_file(tmp_path):
+def test_set_stands_above_the_file_which_may_hold_plain_names(tmp_path):
     file = tmp_path / 'p.yaml'
     file.write_text(as_yaml(values={**Settings(), 'time_constant': 33.0, 'unit_tag': 'B2'}))
     found = read_parameters(file, ['time_constant=44', 'record=no', 'max_pieces=7'])
-    assert found['time_constant'] == 44.0
-    assert found['unit_tag'] == 'B2'
-    assert found['record'] is False
-    assert found['max_pieces'] == 7
-    assert Settings(found).real('time_constant') == 44.0
-
-
-def test_a_file_may_hold_plain_names(tmp_path):
-    file = tmp_path / 'p.yaml'
+    assert found == {**Settings(), 'unit_tag': 'B2', 'time_constant': 44.0, 'record': False,
+                     'max_pieces': 7}  # fmt: skip
     file.write_text('time_constant: 33\n')
     assert read_parameters(file, []) == {'time_constant': 33.0}
-    file.write_text('')
-    assert read_parameters(file, []) == {}
-
-
-@pytest.mark.parametrize(
-    ('text', 'part'),
-    [
-        ('a: [1', 'no YAML'),
-        ('- 1\n- 2\n', 'names and values'),
-        ('/**:\n  ros__parameters:\n    time_constnt: 1.0\n', 'did you mean'),
-        ('time_constant: fast\n', 'must be a number'),
-    ],
-)
-def test_wrong_files_are_refused_with_their_name(tmp_path, text, part):
-    file = tmp_path / 'p.yaml'
-    file.write_text(text)
-    with pytest.raises(InputError) as refused:
-        read_parameters(file, [])
-    assert part in str(refused.value)
-    assert 'p.yaml' in str(refused.value)
-
-
-def test_an_absent_file_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match='no such file'):
-        read_parameters(tmp_path / 'none.yaml', [])
 
 
 STEPS = st.dictionaries(st.sampled_from(Signal), st.floats(1e-3, 1e5), max_size=5)
@@ -159,33 +137,60 @@ def test_what_a_person_sets_is_not_adapted(steps, span_s, name):
     assert name not in fitting(steps, span_s, {name: 50.0})
 
 
-@given(st.floats(1e-3, 1.05))
-def test_quick_data_keep_the_default_step(step):
-    assert sample_period({Signal.VALVE_OPENING: step}) == PARAMETERS['sample_period'].default
-
-
-@given(st.floats(1.06, 3600.0))
-def test_slow_data_decide_the_step(step):
+@given(st.floats(1e-3, 3600.0))
+def test_slow_data_decide_the_step_and_quick_ones_keep_the_default(step):
     found = sample_period({Signal.VALVE_OPENING: step, Signal.GENERATED_POWER: 2.0 * step})
-    assert math.isclose(found, step, rel_tol=0.0527)
+    assert math.isclose(found, max(step, 1.0), rel_tol=0.0527)
 
 
 def test_minute_data_as_the_documentation_says():
     adapted = fitting({Signal.VALVE_OPENING: 60.0}, 7 * 86400.0, {})
-    assert adapted['sample_period'] == 60.0
-    assert adapted['hold_limit'] == 150.0
-    assert adapted['block'] == 60.0
-    assert adapted['lateness'] == 60.0
-    assert 'longest_segment' not in adapted
-    assert 'window_days' not in adapted
+    told = {'sample_period': 60.0, 'hold_limit': 150.0, 'block': 60.0, 'lateness': 60.0}
+    assert {name: adapted[name] for name in told} == told
+    assert not {'longest_segment', 'window_days'} & set(adapted)
     assert fitting({}, 30 * 86400.0, {})['window_days'] >= 30.0
-
-
-def test_a_finished_log_is_fitted_once_whatever_the_file_says():
+    # A finished log is fitted once whatever the file says.
     settings, _ = settings_for({}, 1e5, {'refit_period': 600.0, 'refit_segments': 5})
     assert settings['refit_period'] == settings['refit_segments'] == 0
-
-
-def test_a_table_finer_than_the_data_is_said_aloud():
     _, said = settings_for({Signal.VALVE_OPENING: 60.0}, 1e5, {'sample_period': 1.0})
     assert any('held in between' in sentence for sentence in said)
+
+
+USUAL = {
+    Signal.VALVE_OPENING: (31.0, 94.0),
+    Signal.MAIN_STEAM_PRESSURE: (8.0, 17.1),
+    Signal.MAIN_STEAM_TEMPERATURE: (525.0, 545.0),
+    Signal.GENERATED_POWER: (140.0, 310.0),
+    Signal.VALVE_COMMAND: (0.5, 99.0),
+}
+
+
+CASES = [(s, unit) for s in Signal for unit in UNITS[s]]
+
+
+def written_in(signal, unit):
+    """Usual values of a signal as a log in ``unit`` would hold them."""
+    low, high = USUAL[signal]
+    values = np.linspace(low, high, 1000)
+    return (values - UNITS[signal][unit].offset) / UNITS[signal][unit].scale
+
+
+@pytest.mark.parametrize(('signal', 'unit'), CASES)
+def test_values_in_another_unit_are_recognised_and_in_their_own_raise_no_doubt(signal, unit):
+    written = written_in(signal, unit)
+    assert doubt(signal, written, unit, Settings()) is None
+    assert doubt(signal, np.array([np.nan, np.inf]), unit, Settings()) is None
+    for taken, factor in UNITS[signal].items():
+        # 812 K read as degF is 433 degC, which a small unit may have.
+        if factor == UNITS[signal][unit] or (unit, taken) == ('K', 'degF'):
+            continue
+        found = doubt(signal, written, taken, Settings())
+        assert found is not None, taken
+        assert UNITS[signal][found.looks_like] == UNITS[signal][unit]
+        assert found.looks_like in found.sentence
+
+
+def test_impossible_values_without_a_better_unit():
+    found = doubt(Signal.GENERATED_POWER, np.array([200.0] * 9 + [-5000.0]), 'MW', Settings())
+    assert found.looks_like == ''
+    assert '10 % of them are impossible' in found.sentence

@@ -12,6 +12,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone, tzinfo
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
@@ -98,17 +99,10 @@ def share_of_time(verb: str, told: float, what: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class VerbResult:
-    """The result of a verb.
+    """The result of a verb for people, and the same for programs.
 
-    Attributes
-    ----------
-    text : str
-        For people.
-    data : mapping
-        The same for programs; values that are not finite become null.
-    drawn : bool
-        The text is a picture for this terminal, with control codes, made from sanitised words.
-        Terminal control characters are removed from any other text.
+    ``drawn``: the text is a picture for this terminal, with control codes, made from sanitised
+    words; terminal control characters are removed from any other text.
     """
 
     text: str
@@ -117,18 +111,7 @@ class VerbResult:
 
 
 class Console(Progress):
-    """Messages, warnings, a progress bar on a terminal, and the result.
-
-    Parameters
-    ----------
-    out, err : text streams
-    as_json : bool
-        Print the result as JSON.
-    quiet : bool
-        Print only warnings and the result.
-    verb : str
-        Name of the verb.
-    """
+    """Messages, warnings, a progress bar on a terminal, and the result, perhaps as JSON."""
 
     def __init__(
         self, out: TextIO, err: TextIO, *, as_json: bool = False, quiet: bool = False,
@@ -207,6 +190,33 @@ class TableOption(NamedTuple):
     value: str
 
 
+def add_file(parser: ArgumentParser, option: str, told: str, *, required: bool = False) -> None:
+    """Add an option for a file."""
+    parser.add_argument(option, metavar='FILE', type=Path, required=required, help=told)
+
+
+def add_output(parser: ArgumentParser, metavar: str, told: str, *, required: bool = True) -> None:
+    """Add the option for the place of the result."""
+    parser.add_argument('-o', '--output', metavar=metavar, type=Path, required=required, help=told)
+
+
+def add_set(parser: ArgumentParser, told: str) -> None:
+    """Add the option for single parameters."""
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs', help=told
+    )
+
+
+def add_parameters(parser: ArgumentParser) -> None:
+    """Add the options for parameters."""
+    add_file(
+        parser,
+        '--params',
+        'parameters: a YAML file as the node takes it, or with one NAME: VALUE in a line',
+    )
+    add_set(parser, 'one parameter, such as time_constant=120; overrides the file')
+
+
 MAPPING_HELP = """\
 names and units (the usual unit first):
   valve_opening             %, fraction
@@ -260,12 +270,8 @@ def add_table(parser: ArgumentParser, gathered: str) -> None:
     ):  # fmt: skip
         about.add_argument(
             f'--{option}', dest=gathered, action='append', metavar=metavar, help=told,
-            type=_table_option(option),
+            type=partial(TableOption, option),
         )  # fmt: skip
-
-
-def _table_option(option: str) -> Callable[[str], TableOption]:
-    return lambda value: TableOption(option, value)
 
 
 def mapping_of(options: Namespace) -> LogMapping:
@@ -284,24 +290,16 @@ def table_words(gathered: Sequence[str | TableOption]) -> dict[str, str]:
 def add_analysis(parser: ArgumentParser, log: str = 'the log to read') -> None:
     """Add the log of an analysis, and the folder of its results."""
     parser.add_argument('log', metavar='LOG', type=Path, help=log)
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent; the report of another verb there is kept',
-    )  # fmt: skip
+    add_output(
+        parser,
+        'DIR',
+        'folder for the results, made if absent; the report of another verb there is kept',
+    )
 
 
 def add_analysis_options(parser: ArgumentParser) -> None:
     """Add the options of every analysis: parameters, additional files, how to read the log."""
-    parser.add_argument(
-        '--params',
-        metavar='FILE',
-        type=Path,
-        help='parameters: a YAML file as the node takes it, or with one NAME: VALUE in a line',
-    )
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='one parameter, such as time_constant=120; overrides the file',
-    )  # fmt: skip
+    add_parameters(parser)
     parser.add_argument(
         '--figures', action='store_true',
         help='also write each picture of the report as PNG and SVG: DIR/figures',
@@ -318,15 +316,24 @@ def add_analysis_options(parser: ArgumentParser) -> None:
     add_mapping(parser)
 
 
-def log_of(options: Namespace, mapping: LogMapping, console: Console) -> Log:
-    """Open the log of an analysis, between the times asked for."""
+def log_of(options: Namespace, console: Console) -> Callable[[], Log]:
+    """Return what opens the log of an analysis, between the times asked for.
+
+    The functions of the interface call it after they have read and checked all other files.
+    """
+    mapping = mapping_of(options)
+    console(0.0, 'starting')
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.records import zone_of
 
     zone = zone_of(mapping.table.time_zone)
-    start, end = (time_ns(text, zone) if text else None for text in (options.start, options.end))
-    console(0.02, 'reading')
-    return open_log(options.log, mapping, progress=console).between(start, end)
+
+    def opened() -> Log:
+        start, end = (time_ns(t, zone) if t else None for t in (options.start, options.end))
+        console(0.02, 'reading')
+        return open_log(options.log, mapping, progress=console).between(start, end)
+
+    return opened
 
 
 def add_covariate(
@@ -347,12 +354,7 @@ def covariates_of(options: Namespace) -> dict[str, str]:
 
 
 def checked_parameters(options: Namespace) -> dict[str, Any]:
-    """Return the parameters set by the user; raise early if the results could not be written.
-
-    Raises
-    ------
-    RecordingError, InputError, UsageError
-    """
+    """Return the parameters set by the user; raise early if the results could not be written."""
     from valveflow_ros.interface.files import check_results
     from valveflow_ros.interface.settings import read_parameters
 
@@ -364,13 +366,7 @@ def checked_parameters(options: Namespace) -> dict[str, Any]:
 def write_results(
     result: Result, options: Namespace, text: str, data: Mapping[str, Any]
 ) -> VerbResult:
-    """Write the files of a result; return its text and data with the list of the files.
-
-    Raises
-    ------
-    RecordingError
-        The files cannot be written.
-    """
+    """Write the files of a result; return its text and data with the list of the files."""
     from valveflow_ros.records import zone_of
     from valveflow_ros.report.words import in_zone
 
@@ -401,16 +397,18 @@ def lines(*parts: str) -> str:
 
 def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str = '  ') -> str:
     """Return rows with aligned columns; the first column left, the others right."""
-    everything = [list(head), *map(list, rows)] if head else [list(r) for r in rows]
-    if not everything:
-        return ''
-    widths = [max(len(row[k]) for row in everything) for k in range(len(everything[0]))]
+    everything = [head, *rows] if head else rows
+    first, *others = (max(map(len, column)) for column in zip(*everything, strict=True))
     told = []
     for row in everything:
-        cells = [row[0].ljust(widths[0])]
-        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        cells = [row[0].ljust(first), *map(str.rjust, row[1:], others)]
         told.append((indent + '  '.join(cells)).rstrip())
     return '\n'.join(told)
+
+
+def table(rows: Sequence[Sequence[str]], head: Sequence[str]) -> str:
+    """Return rows below their head; nothing if there are none."""
+    return columns(rows, head) if rows else ''
 
 
 def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
@@ -420,8 +418,7 @@ def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
 
     told = []
     for topic, by_reason in counts.items():
-        refused = rejected({topic: by_reason})
-        if refused:
+        if refused := rejected({topic: by_reason}):
             words = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
             told.append(f'  {topic}: {words}')
     if not any(n for by_reason in counts.values() for n in by_reason.values()):

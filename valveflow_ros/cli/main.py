@@ -21,7 +21,13 @@ from types import FrameType
 from typing import Any, NoReturn, Protocol, cast
 
 from valveflow_ros.cli.command import Console, VerbResult
-from valveflow_ros.errors import LOADING_BYTES, UsageError, ValveflowError, check_address_space
+from valveflow_ros.errors import (
+    LOADING_BYTES,
+    UsageError,
+    ValveflowError,
+    check_address_space,
+    listed,
+)
 from valveflow_ros.interface.files import check_folder, check_readable, check_writable
 
 DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
@@ -35,11 +41,7 @@ _BLAS_THREADS = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 # In the order in which a new user needs them: verb, module, description.
 VERBS: tuple[tuple[str, str, str], ...] = (
-    (
-        'simulate',
-        'simulate',
-        'simulate a plant, with any effect switched on',
-    ),
+    ('simulate', 'simulate', 'simulate a plant, with any effect switched on'),
     ('import', 'import_table', 'make a log from a table of a historian'),
     ('info', 'info', 'show the contents and the quality of a log'),
     ('identify', 'identify', 'find the flow characteristic'),
@@ -77,8 +79,11 @@ A log is an .mcap file (a recording of ROS 2), a rosbag2 folder, or a table: .cs
 class Verb(Protocol):
     """The interface of the module of a verb."""
 
+    USAGE: str
+    DESCRIPTION: str
+
     def arguments(self, parser: ArgumentParser) -> None:
-        """Add description, example and options."""
+        """Add the options."""
 
     def run(self, options: Namespace, console: Console) -> VerbResult:
         """Run the verb."""
@@ -91,20 +96,13 @@ def overview() -> str:
 
 
 def load(name: str) -> Verb:
-    """Return the module of a verb.
-
-    Raises
-    ------
-    UsageError
-        There is no such verb; the message names the most similar one.
-    """
-    for verb, module, _ in VERBS:
-        if verb == name:
-            return cast(Verb, importlib.import_module(f'valveflow_ros.cli.verbs.{module}'))
-    known = [verb for verb, _, _ in VERBS]
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f" Did you mean '{near[0]}'?" if near else f' The verbs are {", ".join(known)}.'
-    raise UsageError(f"There is no verb '{name}'.{hint}")
+    """Return the module of a verb; raise `UsageError`, which names the most similar one."""
+    modules = {verb: module for verb, module, _ in VERBS}
+    if name not in modules:
+        near = difflib.get_close_matches(name, modules, n=1)
+        hint = f" Did you mean '{near[0]}'?" if near else f' The verbs are {", ".join(modules)}.'
+        raise UsageError(f"There is no verb '{name}'.{hint}")
+    return cast(Verb, importlib.import_module(f'valveflow_ros.cli.verbs.{modules[name]}'))
 
 
 class Parser(ArgumentParser):
@@ -132,17 +130,12 @@ class Parser(ArgumentParser):
         """Raise the error of argparse as a sentence."""
         missing = message.removeprefix('the following arguments are required: ')
         if missing != message:
-            *most, last = missing.split(', ')
-            text = f'Something is missing: {", ".join(most)}{" and " if most else ""}{last}.'
-            raise UsageError(text)
+            raise UsageError(f'Something is missing: {listed(missing.split(", "))}.')
         words = message.removeprefix('unrecognized arguments: ')
         if words != message:
-            output = (
-                ' Write an output as -o OUTPUT.' if '-o' in self._option_string_actions else ''
-            )
+            output = ' Write an output as -o OUTPUT.' * ('-o' in self._option_string_actions)
             raise UsageError(f"'{words}' is one argument too many.{output}")
-        text = _sentence(message)
-        raise UsageError(text if text.endswith('.') else f'{text}.')
+        raise UsageError(f'{_sentence(message).removesuffix(".")}.')
 
 
 def _sentence(message: str) -> str:
@@ -167,7 +160,9 @@ class _Formatter(RawDescriptionHelpFormatter):
 def parser_of(name: str, verb: Verb | None = None) -> Parser:
     """Return the parser of a verb; raises `UsageError` if there is none of that name."""
     parser = Parser(f'valveflow {name}')
-    (verb or load(name)).arguments(parser)
+    verb = verb or load(name)
+    parser.usage, parser.description = f'valveflow {name} {verb.USAGE}', verb.DESCRIPTION
+    verb.arguments(parser)
     parser.add_argument(
         '--json', action='store_true', help='print the result as JSON, for programs'
     )
@@ -178,14 +173,9 @@ def parser_of(name: str, verb: Verb | None = None) -> Parser:
 
 
 def check_paths(parser: ArgumentParser, options: Namespace) -> None:
-    """Raise early if the path in an option cannot be read or written.
+    """Raise `RecordingError` for the first path in the options that cannot be read or written.
 
     The content of files is checked by the verb.
-
-    Raises
-    ------
-    RecordingError
-        For the first of them, with the reason.
     """
     for action in parser._actions:
         path = getattr(options, action.dest, None)
@@ -202,13 +192,7 @@ def check_paths(parser: ArgumentParser, options: Namespace) -> None:
 
 
 class Stop:
-    """Turns signals into `KeyboardInterrupt` and stores the first.
-
-    Attributes
-    ----------
-    number : int
-        The received signal; 0 if none.
-    """
+    """Turns signals into `KeyboardInterrupt`; ``number`` is the first received one, or 0."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -257,7 +241,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 success, 1 failure, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
+        0 done, 1 not possible, 2 wrong usage, 130 stopped by Ctrl-C, 143 by the system.
     """
     if '_ARGCOMPLETE' in os.environ:
         from valveflow_ros.cli.verbs.completion import complete
@@ -281,8 +265,8 @@ def _guarded(words: list[str], console: Console, stop: Stop) -> int:
     try:
         return _command(words, console)
     except UsageError as error:
-        hint = f'valveflow {words[0]} --help' if _is_verb(words) else 'valveflow --help'
-        console.fail(f'{error} Try "{hint}".')
+        verb = f'{words[0]} ' if words[0] in {name for name, _, _ in VERBS} else ''
+        console.fail(f'{error} Try "valveflow {verb}--help".')
         return WRONG_USAGE
     except ValveflowError as error:
         _show_traceback()
@@ -333,14 +317,6 @@ def _command(words: list[str], console: Console) -> int:
         check_paths(parser, options)
     console.finish(verb.run(options, console))
     return DONE
-
-
-def _is_verb(words: list[str]) -> bool:
-    try:
-        load(words[0])
-    except (UsageError, IndexError):
-        return False
-    return True
 
 
 def _show_traceback() -> None:

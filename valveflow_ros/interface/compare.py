@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,34 +16,18 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.fit.result import wrong_form
-from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import Result
+from valveflow_ros.interface import SILENT, Progress, models
+from valveflow_ros.interface.files import Result, as_text
 from valveflow_ros.interface.logs import Log, as_log
-from valveflow_ros.interface.models import (
-    Model,
-    check_output,
-    load_characteristic,
-    load_model,
-    load_truth,
-    model_path,
-    with_exponent,
-)
+from valveflow_ros.interface.models import Model
 from valveflow_ros.interface.observation import Observed, cut_in_two, observe_log, settings_of
 from valveflow_ros.parameters import PARAMETERS, Settings
+from valveflow_ros.report import comparison_tables
+from valveflow_ros.report import validation as validation_report
 from valveflow_ros.report.comparison import comparison_page, data_words, finding_words
-from valveflow_ros.report.comparison_tables import (
-    Compared,
-    curves_csv,
-    parameters_csv,
-    segments_csv,
-)
+from valveflow_ros.report.comparison_tables import Compared
 from valveflow_ros.report.page import Page
-from valveflow_ros.report.validation import (
-    OUTSIDE_FLAG,
-    Validated,
-    validation_page,
-    verdict_words,
-)
+from valveflow_ros.report.validation import Validated
 from valveflow_ros.report.words import held_words, percent
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 
@@ -82,10 +65,12 @@ class ComparisonResult(Result):
             'words': [data_words(data), *finding_words(data)],
         }
         return {
-            'comparison.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
-            'parameters.csv': parameters_csv(data),
-            'segments.csv': segments_csv(data.result.judgement, data.predictions),
-            'curves.csv': curves_csv(data),
+            'comparison.json': as_text(content, 1),
+            'parameters.csv': comparison_tables.parameters_csv(data),
+            'segments.csv': comparison_tables.segments_csv(
+                data.result.judgement, data.predictions
+            ),
+            'curves.csv': comparison_tables.curves_csv(data),
         }
 
 
@@ -108,7 +93,7 @@ class ValidationResult(Result):
 
     def page(self) -> Page:
         """Return the report."""
-        return validation_page(self.data)
+        return validation_report.validation_page(self.data)
 
     def texts(self) -> dict[str, str]:
         """Return ``validation.json`` and ``segments.csv``."""
@@ -120,12 +105,12 @@ class ValidationResult(Result):
             'model': data.model,
             'against': data.other or None,
             'held': [h.name for h in data.result.characteristic.held],
-            'words': verdict_words(data),
+            'words': validation_report.verdict_words(data),
         }
         predictions = tuple(data.result.predictions)
         return {
-            'validation.json': json.dumps(content, indent=1, allow_nan=False) + '\n',
-            'segments.csv': segments_csv(data.result.judgement, predictions),
+            'validation.json': as_text(content, 1),
+            'segments.csv': comparison_tables.segments_csv(data.result.judgement, predictions),
         }
 
 
@@ -159,7 +144,7 @@ def compare(
     # The other two methods are used as in the paper: their input is V p^m.
     given = {**(parameters or {}), 'axis': INTEGRATED_INPUT}
     if truth is not None and not isinstance(truth, Truth):
-        truth = load_truth(truth)
+        truth = models.load_truth(truth)
     log = _not_empty(as_log(log, progress))
     if test is None:
         block = given.get('block', PARAMETERS['block'].default)
@@ -219,11 +204,16 @@ def validate(
     RecordingError, InputError, DataError
         The log cannot be read or contains no data for the test.
     """
-    curve, second, given = check_models(model, against, parameters or {})
+    curve, given = models.taken_model(model, parameters, models.load_model)
+    assert curve is not None
+    second = models.taken_curve(against)
+    if second is not None and isinstance(curve, ExtendedModel):
+        raise UsageError(
+            '--against takes two curves over the same rows, and those of an extended model are '
+            'freed of its causes: validate each by itself and compare their errors.'
+        )
     log = _not_empty(as_log(log, progress))
-    for one, called in ((curve, 'The model'), (second, 'The second curve')):
-        if one is not None:
-            check_output(one, log.output_unit, called)
+    models.check_output(log.output_unit, model=curve, second_curve=second)
     extended = None
     if isinstance(curve, ExtendedModel):
         extended, curve = curve, curve.characteristic()
@@ -232,7 +222,7 @@ def validate(
     progress(0.7, 'judging')
     tolerance = tolerance_mw or settings.real('alarm_floor')
     result = validation.validate(curve, other_data(contents, settings), tolerance, second)
-    if result.outside_share > OUTSIDE_FLAG:
+    if result.outside_share > validation_report.OUTSIDE_FLAG:
         progress.warn(
             f'{percent(result.outside_share, 2)} of the special samples lie beyond the ends of '
             'the curve and were not judged.'
@@ -249,41 +239,12 @@ def validate(
     return ValidationResult(Validated(log.name, *names, result, contents, notes, held))
 
 
-def check_models(
-    model: Model | str | Path, against: Characteristic | str | Path | None,
-    parameters: Mapping[str, Any],
-) -> tuple[Model, Characteristic | None, dict[str, Any]]:  # fmt: skip
-    """Read the curves of a validation and check that they can be used together.
-
-    The returned parameters contain the pressure exponent of the model.
-
-    Raises
-    ------
-    RecordingError
-        A file cannot be read.
-    UsageError
-        ``against`` is given with an extended model, which is tested on rows after removing
-        its causes; or the parameters give another pressure exponent.
-    """
-    first = model if isinstance(model, Characteristic | ExtendedModel) else load_model(model)
-    second = against
-    if second is not None and not isinstance(second, Characteristic):
-        second = load_characteristic(second)
-    if second is not None and isinstance(first, ExtendedModel):
-        raise UsageError(
-            '--against takes two curves over the same rows, and those of an extended model are '
-            'freed of its causes: validate each by itself and compare their errors.'
-        )
-    name = 'The model' if first is model else model
-    return first, second, with_exponent(first, parameters, name)
-
-
 def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
     """Return a file's name, with its folder if a folder was given or two names would be equal."""
     if isinstance(model, Characteristic | ExtendedModel):
         return getattr(model, 'model_id', '') or 'the model'
-    file = model_path(Path(model))
-    alike = isinstance(other, str | Path) and model_path(Path(other)).name == file.name
+    file = models.model_path(Path(model))
+    alike = isinstance(other, str | Path) and models.model_path(Path(other)).name == file.name
     return str(file) if alike or file != Path(model) else file.name
 
 

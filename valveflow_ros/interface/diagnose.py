@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,6 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
-from valveflow_ros.diagnosis.causes import check_covariates
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
@@ -23,9 +21,9 @@ from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import Result, signed
+from valveflow_ros.interface.files import Result, as_text, signed
 from valveflow_ros.interface.logs import Log, as_log, read_covariate
-from valveflow_ros.interface.models import Model, check_output, load_model, with_exponent
+from valveflow_ros.interface.models import Model, check_output, load_model, taken_model
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import (
     Covariates,
@@ -33,8 +31,9 @@ from valveflow_ros.interface.observation import (
     corrected,
     observe_log,
     settings_of,
+    taken_covariates,
 )
-from valveflow_ros.parameters import Settings, covariate_columns
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SIGNALS, IntArray, SampleTable
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
 from valveflow_ros.report.page import Page
@@ -96,14 +95,9 @@ class DiagnosisResult(Result):
 
     def texts(self) -> dict[str, str]:
         """Return ``diagnosis.json`` and ``extended_model.json``."""
-        contents = {
-            'diagnosis.json': {**to_json(self.diagnosis), 'output_unit': self.output_unit},
-            'extended_model.json': signed(model_to_json(self.extended_model), self.verb),
-        }
-        return {
-            name: json.dumps(content, indent=2, allow_nan=False) + '\n'
-            for name, content in contents.items()
-        }
+        diagnosis = {**to_json(self.diagnosis), 'output_unit': self.output_unit}
+        model = signed(model_to_json(self.extended_model), self.verb)
+        return {'diagnosis.json': as_text(diagnosis), 'extended_model.json': as_text(model)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +129,7 @@ class _Rows:
         return None if form.axis == given.axis else (form, model)
 
 
-def load_diagnosable(path: str | Path) -> Model:
-    """Return the model in a file, with which a log is to be compared.
-
-    Raises
-    ------
-    RecordingError, DataError
-        The file cannot be read, or contains a curve without dynamics.
-    """
+def _load_diagnosable(path: str | Path) -> Model:
     model = load_model(path)
     if isinstance(model, Characteristic) and not model.dynamics:
         raise DataError(
@@ -185,18 +172,10 @@ def diagnose(
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
-    given = dict(parameters or {})
-    if covariates is None:
-        covariates = covariate_columns(str(given.get('covariates', '')).split())
-    check_covariates(covariates)
-    if model is not None:
-        name = 'The model' if isinstance(model, Characteristic | ExtendedModel) else model
-        if not isinstance(model, Characteristic | ExtendedModel):
-            model = load_diagnosable(model)
-        given = with_exponent(model, given, name)
+    model, given = taken_model(model, parameters, _load_diagnosable)
+    covariates = taken_covariates(covariates, given)
     log = as_log(log, progress)
-    if model is not None:
-        check_output(model, log.output_unit, 'The model')
+    check_output(log.output_unit, model=model)
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
     rows = _rows(log, settings, model is None, progress, earlier)
@@ -210,7 +189,7 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
-    beside = covariate_rows(log, covariates, rows.table)
+    beside = _covariate_rows(log, covariates, rows.table)
     record = search.Record(
         rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
         covariates=beside,
@@ -246,16 +225,10 @@ def diagnose(
     return DiagnosisResult(data, form, earlier)
 
 
-def covariate_rows(
+def _covariate_rows(
     log: Log, said: Mapping[str, str], table: SampleTable
 ) -> tuple[CovariateRows, ...]:
-    """Return the covariates at the rows of a table.
-
-    Raises
-    ------
-    InputError
-        A column is missing, or has values for fewer than half of the rows.
-    """
+    """Return the covariates at the rows of a table; a column must cover half of them."""
     found = []
     for name, theirs in said.items():
         series = read_covariate(log, name, theirs)
@@ -285,13 +258,9 @@ def _rows(
         return _Rows(table, np.empty((0, 2), dtype=np.int64), None, form, why)
     spans = np.array([(s.start_ns, s.end_ns) for s in observed.segments], dtype=np.int64)
     rows = _Rows(
-        observed.table,
-        spans.reshape(-1, 2),
-        None,
-        observed.paper_form,
-        places=observed.rows,
+        observed.table, spans.reshape(-1, 2), None, observed.paper_form, places=observed.rows,
         observed=observed,
-    )
+    )  # fmt: skip
     if not wanted:
         return rows
     try:

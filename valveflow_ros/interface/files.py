@@ -62,13 +62,7 @@ def reason(error: OSError) -> str:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary name in the folder of ``path``; it is renamed to ``path`` on success.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be written.
-    """
+    """Yield a temporary name beside ``path``, which is renamed to it on success."""
     # The suffix must stay last because writers choose the format by it.
     draft = path.with_name(f'.{path.stem}.{os.getpid()}.draft{path.suffix}')
     try:
@@ -81,13 +75,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) -> dict[str, Path]:
-    """Write files into a folder, created if absent; if one fails, no file is replaced.
-
-    Raises
-    ------
-    RecordingError
-        The folder or a file cannot be written.
-    """
+    """Write files into a folder, created if absent; if one fails, no file is replaced."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -109,13 +97,7 @@ def write_texts(folder: Path, texts: Mapping[str, str] | Mapping[str, bytes]) ->
 
 
 def write_log(table: SampleTable, path: Path, overwrite: bool = False) -> Path:
-    """Write rows as CSV, Parquet, MCAP or a recording's folder, by the suffix; return the path.
-
-    Raises
-    ------
-    RecordingError
-        It cannot be written, or exists already.
-    """
+    """Write rows as CSV, Parquet, MCAP or a recording's folder, by the suffix; return the path."""
     from valveflow_ros.logs import write_samples, write_table
 
     if path.suffix.lower() in TABLES:
@@ -128,18 +110,8 @@ def write_log(table: SampleTable, path: Path, overwrite: bool = False) -> Path:
 def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict[Path, int]:
     """Write the outputs of a recorded monitor, one table per kind; return the row count by file.
 
-    Parameters
-    ----------
-    log : LogContents
-    path : Path
-        ``out.csv`` or ``out.parquet`` gives ``out_curves.csv``, ``out_alarms.csv``, ...
-
-    Raises
-    ------
-    DataError
-        The recording contains no output of a monitor.
-    RecordingError
-        A table cannot be written, or exists already.
+    ``out.csv`` gives ``out_curves.csv``, ``out_alarms.csv``, ... Raises `DataError` if there is no
+    output of a monitor, `RecordingError` if a table cannot be written, or exists already.
     """
     from valveflow_ros.logs import outputs_in
     from valveflow_ros.logs import write_outputs as write_kind
@@ -152,6 +124,11 @@ def write_outputs(log: LogContents, path: Path, overwrite: bool = False) -> dict
         with whole_file(place) as draft:
             found[place] = write_kind(log, kind, draft)
     return found
+
+
+def as_text(content: Mapping[str, Any], indent: int = 2) -> str:
+    """Return the text of a JSON file."""
+    return json.dumps(content, indent=indent, allow_nan=False) + '\n'
 
 
 def is_empty(path: Path) -> bool:
@@ -172,13 +149,17 @@ def check_readable(path: Path, what: str) -> None:
 def check_writable(path: Path) -> None:
     """Raise `RecordingError` if a file could not be written."""
     folder = path.absolute().parent
-    if path.is_dir():
-        raise RecordingError(path, 'is a folder; name a file')
-    if not folder.is_dir():
-        raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
+    _check_place(path)
     if not os.access(folder, os.W_OK | os.X_OK):
         raise RecordingError(path, f'cannot be written ({os.strerror(errno.EACCES).lower()})')
     _try_folder(folder, 'choose another place for it')
+
+
+def _check_place(path: Path) -> None:
+    if path.is_dir():
+        raise RecordingError(path, 'is a folder; name a file')
+    if not path.absolute().parent.is_dir():
+        raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
 
 
 def check_folder(folder: Path) -> None:
@@ -196,23 +177,14 @@ def check_folder(folder: Path) -> None:
 def check_output(
     path: Path, suffixes: tuple[str, ...], *, source: Path | None = None, overwrite: bool = False
 ) -> None:
-    """Refuse an output file that cannot be written or must not be replaced.
-
-    Raises
-    ------
-    RecordingError
-        Its type is unknown, its folder does not exist, it is the input, or it exists already.
-    """
+    """Raise `RecordingError` if an output file cannot be written or must not be replaced."""
     if path.suffix.lower() not in suffixes:
         raise RecordingError(path, f'must end in {" or ".join(suffixes)}')
     if path.suffix.lower() == '.parquet':
         from valveflow_ros.logs.tables.binary import check_parquet
 
         check_parquet(path)
-    if path.is_dir():
-        raise RecordingError(path, 'is a folder; name a file')
-    if not path.absolute().parent.is_dir():
-        raise RecordingError(path, f"cannot be written: there is no folder '{path.parent}'")
+    _check_place(path)
     _try_folder(path.absolute().parent, 'choose another place for the output')
     if not path.exists():
         return
@@ -330,13 +302,9 @@ class Result:
         return go.Figure(content['data'], {**base, **content['layout']})
 
     def write(
-        self,
-        folder: str | Path,
-        *,
-        figures: bool = False,
-        tables: bool = False,
+        self, folder: str | Path, *, figures: bool = False, tables: bool = False,
         time_zone: str = '',
-    ) -> WrittenFiles:
+    ) -> WrittenFiles:  # fmt: skip
         """Write the files of the result, and pictures and tables on request.
 
         Parameters
@@ -403,16 +371,9 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class WrittenFiles:
-    """The paths of the files of a result.
+    """The paths of the files of a result by name, and the same as sentences.
 
-    Attributes
-    ----------
-    files : dict of str to Path
-        By name.
-    kept : mapping of str to str
-        New names of the files that existed before, by old name.
-    words : tuple of str
-        The same information as sentences.
+    ``kept`` has the new names of the files that existed before, by old name.
     """
 
     files: dict[str, Path]
@@ -423,12 +384,8 @@ class WrittenFiles:
 def check_results(folder: Path, figures: bool, tables: bool) -> None:
     """Check before a long calculation that its results can be written.
 
-    Raises
-    ------
-    InputError
-        plotly is not installed, or pictures are requested and matplotlib is not installed.
-    RecordingError
-        A folder is not writable.
+    Raises `RecordingError` if not, and `InputError` if plotly, or for pictures matplotlib, is not
+    installed.
     """
     from valveflow_ros.report.page import plotly_script
 
@@ -472,16 +429,10 @@ def writer(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """Files that another verb or another program had written, and their new names.
+    """Files that another verb or another program had written: their new names by old name.
 
-    Attributes
-    ----------
-    names : mapping of str to str
-        New names by old name.
-    verb : str
-        The verb whose report was kept, empty if none was kept or the verb is unknown.
-    old : str
-        Name of an earlier report of the current verb beside the new one, or empty.
+    ``verb`` is the verb whose report was kept, empty if none was kept or the verb is unknown;
+    ``old`` the name of an earlier report of the current verb beside the new one, or empty.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -501,13 +452,7 @@ class Backup:
 
 
 def back_up(folder: Path, verb: str, names: Collection[str]) -> Backup:
-    """Copy the files that ``verb`` will replace, unless ``verb`` certainly wrote them itself.
-
-    Raises
-    ------
-    RecordingError
-        A copy cannot be made; no file has been replaced.
-    """
+    """Copy the files that ``verb`` will replace, unless ``verb`` certainly wrote them itself."""
     kept: dict[str, str] = {}
     # The message names the report first.
     for name in sorted(names, key=lambda n: n != REPORT):

@@ -24,19 +24,15 @@ from valveflow_ros.fit.static_test import find_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import Result, signed, writer
+from valveflow_ros.interface.files import Result, as_text, signed, writer
 from valveflow_ros.interface.logs import Log, as_log
-from valveflow_ros.interface.models import (
-    check_output,
-    load_characteristic,
-    load_extended,
-    with_exponent,
-)
+from valveflow_ros.interface.models import check_output, load_extended, taken_curve, taken_model
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import check_signals, observe_log, settings_of
 from valveflow_ros.records import (
     N_SIGNALS,
     SIGNALS,
+    FloatArray,
     Quality,
     Readings,
     SampleTable,
@@ -127,17 +123,13 @@ class Identification(Result):
         With a model also the extended model with the new curve.
         """
         c = self.characteristic
-        contents = {CURVE: to_json(c)}
+        files = {CURVE: as_text(to_json(c))}
         if self.data.shift is not None:
-            contents['shift.json'] = shift_json(self.data.shift)
-        files = {
-            name: json.dumps(content, indent=2, allow_nan=False) + '\n'
-            for name, content in contents.items()
-        }
+            files['shift.json'] = as_text(shift_json(self.data.shift))
         if self.model is not None and c.dynamics:
             anew = Extended(c.model, self.model.model.active)
-            model = signed(model_to_json(replace(self.model, model=anew)), self.verb)
-            files['extended_model.json'] = json.dumps(model, indent=2) + '\n'
+            model = model_to_json(replace(self.model, model=anew))
+            files['extended_model.json'] = as_text(signed(model, self.verb))
         return files
 
 
@@ -174,27 +166,17 @@ def identify(
     RecordingError, InputError
         A file cannot be read, or a parameter is wrong.
     """
-    given = dict(parameters or {})
-    if model is not None:
-        if step_test:
-            raise UsageError('--step-test and --model do not go together.')
-        name = 'The model' if isinstance(model, ExtendedModel) else model
-        model = model if isinstance(model, ExtendedModel) else load_extended(model)
-        given = with_exponent(model, given, name)
-    if reference is not None and not isinstance(reference, Characteristic):
-        reference = load_characteristic(reference)
+    if model is not None and step_test:
+        raise UsageError('--step-test and --model do not go together.')
+    model, given = taken_model(model, parameters, load_extended)
+    reference = taken_curve(reference)
     log = as_log(log, progress)
-    for curve, called in ((model, 'The model'), (reference, 'The reference')):
-        if curve is not None:
-            check_output(curve, log.output_unit, called)
+    check_output(log.output_unit, model=model, reference=reference)
     found = (
         _step_test(log, given, progress) if step_test
         else _identified(log, given, model, reference, progress)
     )  # fmt: skip
-    opening, pressure = (
-        found.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
-    )
-    seen = openings_seen(opening, pressure)
+    seen = openings_seen(*_inputs(found.table))
     found = replace(found, characteristic=replace(found.characteristic, openings_seen=seen))
     if reference is not None:
         settings = found.settings
@@ -249,14 +231,16 @@ def _identified(
         notes=(*log.notes, *notes, *told), mixture=mixture,
         history=recorded_history(log.contents),
     )  # fmt: skip
-    opening, pressure = (
-        observed.table.column(s) for s in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
-    )
     misfit = find_misfit(
-        opening, pressure, found.power - found.static_mw, found.power, found.rows,
+        *_inputs(found.table), found.power - found.static_mw, found.power, found.rows,
         settings.real('sample_period'),
     )  # fmt: skip
     return replace(found, misfit=misfit)
+
+
+def _inputs(table: SampleTable) -> tuple[FloatArray, FloatArray]:
+    """Return opening and pressure."""
+    return table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE)
 
 
 def _rows_as_read(readings: Readings) -> SampleTable:

@@ -7,25 +7,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from valveflow_ros.errors import DataError, InputError
-from valveflow_ros.interface import SILENT, Progress
+from valveflow_ros.interface import SILENT, Progress, plausibility
 from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, gather_refusals, read_mapping
-from valveflow_ros.interface.plausibility import (
-    Doubt,
-    air_note,
-    check_constants,
-    doubt,
-    limits_beside_steam,
-    refuse_guesses,
-    refuse_impossible,
-    with_constants,
-)
+from valveflow_ros.interface.plausibility import Doubt
 from valveflow_ros.logs import LogContents
 from valveflow_ros.logs import open_log as read_file
 from valveflow_ros.logs.names import signal_of
@@ -36,6 +26,7 @@ from valveflow_ros.records import (
     FLOW_UNITS,
     N_SIGNALS,
     SIGNALS,
+    BoolArray,
     FloatArray,
     IntArray,
     Quality,
@@ -127,7 +118,14 @@ class Log:
         """
         if start_ns is None and end_ns is None:
             return self
-        cut = partial(_between, start_ns=start_ns, end_ns=end_ns)
+
+        def cut(readings: Readings) -> Readings:
+            times, ends = readings.time_ns, np.iinfo(np.int64)
+            first = ends.min if start_ns is None else start_ns
+            return plausibility.selected(
+                readings, (times >= first) & (times <= (ends.max if end_ns is None else end_ns))
+            )
+
         readings = cut(self.readings)
         if not len(readings):
             times = self.readings.time_ns
@@ -150,7 +148,7 @@ class Log:
         InputError
             The given parameters name another unit of the flow.
         """
-        found: dict[str, Any] = {**limits_beside_steam(self.units, self.constants)}
+        found: dict[str, Any] = {**plausibility.limits_beside_steam(self.units, self.constants)}
         told: list[str] = []
         unit = self.output_unit
         wanted = given.get('generated_power_unit', unit)
@@ -228,18 +226,6 @@ class Log:
         return pd.DataFrame(columns)
 
 
-def _between(readings: Readings, start_ns: int | None, end_ns: int | None) -> Readings:
-    inside = np.ones(len(readings), dtype=bool)
-    if start_ns is not None:
-        inside &= readings.time_ns >= start_ns
-    if end_ns is not None:
-        inside &= readings.time_ns <= end_ns
-    return Readings(
-        readings.time_ns[inside], readings.signal[inside], readings.value[inside],
-        readings.quality[inside],
-    )  # fmt: skip
-
-
 def open_log(
     source: Any,
     mapping: LogMapping | None = None,
@@ -315,28 +301,14 @@ def open_log(
 def read_covariate(log: Log, name: str, said: str) -> Series:
     """Read a further column of a log, without conversion of units and without limits.
 
-    Parameters
-    ----------
-    log : Log
-        From `open_log`.
-    name : str
-        Name of the covariate in messages.
-    said : str
-        ``COLUMN`` or ``COLUMN:unit``; of a recording a topic of Float64.
-
-    Raises
-    ------
-    InputError
-        There is no such column, or it contains no number.
+    ``name`` is that of the covariate in messages, ``said`` is ``COLUMN`` or ``COLUMN:unit``; of a
+    recording a topic of Float64. Raises `InputError` if there is none, or no number in it.
     """
     return read_series(log.source, log.mapping, log.name, name, said)
 
 
 def read_series(source: Any, mapping: LogMapping, log: str, name: str, said: str) -> Series:
-    """Read a further column of a file or DataFrame; see `read_covariate`.
-
-    ``log`` is the name of the file in messages.
-    """
+    """Read a further column of the file or DataFrame called ``log``; see `read_covariate`."""
     theirs, colon, told = said.rpartition(':')
     contents = _column_of(source, mapping, theirs.strip()) if colon and theirs else None
     if contents is None:  # a column's name may itself contain a colon
@@ -359,12 +331,10 @@ def read_series(source: Any, mapping: LogMapping, log: str, name: str, said: str
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A further column of a log.
+    """A further column of a log, with its unit, '' if unknown.
 
     Attributes
     ----------
-    column, unit : str
-        Its name in the log; its unit, '' if unknown.
     time_ns : int64 (k,)
         Not decreasing.
     values : float64 (k,)
@@ -441,7 +411,8 @@ _COVARIATE_UNITS = {
 
 
 def as_log(log: Any, progress: Progress) -> Log:
-    """Return a log unchanged, or open it from a file or a DataFrame."""
+    """Return a log unchanged, or open it: by a call, or from a file or a DataFrame."""
+    log = log() if callable(log) else log
     return log if isinstance(log, Log) else open_log(log, progress=progress)
 
 
@@ -468,20 +439,21 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
     stated = {**units, **mapping.constant_units}
     output = engine_unit(Signal.GENERATED_POWER, stated.get(Signal.GENERATED_POWER, ''))
     progress.measured_in(output)
-    settings = Settings(limits_beside_steam(stated, constants))
-    check_constants(constants, settings)
+    settings = Settings(plausibility.limits_beside_steam(stated, constants))
+    plausibility.check_constants(constants, settings)
     measured_signals = sorted(units.keys() - constants.keys())
     for signal in measured_signals:
-        if note := air_note(signal, units[signal], contents.signals[signal]):
+        if note := plausibility.air_note(signal, units[signal], contents.signals[signal]):
             progress.say(note)
     raw, steam = contents.readings, output == 'MW'
     judged = (
-        doubt(s, raw.value[raw.signal == s], units[s], settings, steam) for s in measured_signals
+        plausibility.doubt(s, raw.value[raw.signal == s], units[s], settings, steam)
+        for s in measured_signals
     )
     doubts = [found for found in judged if found is not None]
-    refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
+    plausibility.refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
     if not contents.topics:  # a table
-        refuse_impossible(contents.path, doubts, contents.signals)
+        plausibility.refuse_impossible(contents.path, doubts, contents.signals)
     for found in doubts:
         progress.warn(found.advice(contents.signals[found.signal]))
     for signal in constants.keys() & contents.signals.keys():
@@ -494,15 +466,12 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
     if compression is not None:
         progress.say(compression.sentence)
     if compression is None or not compression.own_times:
-        readings = with_constants(measured, constants)
+        readings = plausibility.with_constants(measured, constants)
         return Log(name, contents, readings, stated, constants, doubts, compression)
-    held = with_constants(held_readings(measured, compression), constants)
-    there = np.isfinite(measured.value)
-    kept = Readings(
-        measured.time_ns[there], measured.signal[there], measured.value[there],
-        measured.quality[there],
-    )  # fmt: skip
-    recorded = with_constants(kept, constants)
+    held = plausibility.with_constants(held_readings(measured, compression), constants)
+    recorded = plausibility.with_constants(
+        plausibility.selected(measured, np.isfinite(measured.value)), constants
+    )
     return Log(name, contents, held, stated, constants, doubts, compression, recorded)
 
 
@@ -553,7 +522,7 @@ def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
     theirs = names.get(TIME, TIME)
     if theirs not in frame.columns and not isinstance(frame.index, pd.DatetimeIndex):
         raise InputError("The DataFrame has no column 'time', and its index holds no times.")
-    time_ns, there = _nanoseconds(frame[theirs] if theirs in frame.columns else frame.index)
+    time_ns, there = nanoseconds(frame[theirs] if theirs in frame.columns else frame.index)
     order = np.flatnonzero(there)[np.argsort(time_ns[there], kind='stable')]
     columns, quality, signals = {}, {}, {}
     for info in SIGNALS:
@@ -579,7 +548,7 @@ def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
     )  # fmt: skip
 
 
-def _nanoseconds(times: Any) -> tuple[IntArray, Any]:
+def nanoseconds(times: Any) -> tuple[IntArray, BoolArray]:
     """Return times in ns since 1970, and which of them can be read."""
     import pandas as pd
 
@@ -592,6 +561,5 @@ def _nanoseconds(times: Any) -> tuple[IntArray, Any]:
         part = np.round((np.where(there, seconds, 0.0) - whole) * 1e9).astype(np.int64)
         return whole.astype(np.int64) * 1_000_000_000 + part, there
     stamps = pd.to_datetime(series, utc=True, errors='coerce')
-    return stamps.astype('datetime64[ns, UTC]').astype(
-        np.int64
-    ).to_numpy(), stamps.notna().to_numpy()
+    time_ns = stamps.astype('datetime64[ns, UTC]').astype(np.int64).to_numpy()
+    return time_ns, stamps.notna().to_numpy()

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,18 +13,10 @@ import numpy as np
 from valveflow_ros.diagnosis.loop.judge import LoopJudgement, judge_position, judge_response
 from valveflow_ros.errors import InputError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import write_texts
-from valveflow_ros.logs.tables.loop_columns import (
-    COMMAND,
-    POSITION,
-    PROCESS,
-    ROLES,
-    SET_POINT,
-    LoopColumns,
-    ordered,
-    read_loop_columns,
-    roles_of,
-)
+from valveflow_ros.interface.files import as_text, write_texts
+from valveflow_ros.interface.logs import nanoseconds
+from valveflow_ros.logs.tables import loop_columns
+from valveflow_ros.logs.tables.loop_columns import COMMAND, POSITION, PROCESS, SET_POINT
 from valveflow_ros.logs.tables.refusal import TableOptions
 from valveflow_ros.logs.tables.times import NEVER
 from valveflow_ros.records import FloatArray
@@ -84,8 +75,7 @@ class LoopResult:
         RecordingError
             It cannot be written.
         """
-        text = json.dumps(self.to_json(), indent=1, allow_nan=False) + '\n'
-        return write_texts(Path(folder), {FILE: text})[FILE]
+        return write_texts(Path(folder), {FILE: as_text(self.to_json(), 1)})[FILE]
 
     def plot(self) -> Any:
         """Return the command and the position or process value as a plotly figure.
@@ -150,29 +140,26 @@ def judge_loop(
     if hasattr(table, 'columns'):
         read = _from_dataframe(table, named, time)
     else:
-        read = read_loop_columns(Path(table), {**named, 'time': time}, options or TableOptions())
+        read = loop_columns.read_loop_columns(
+            Path(table), {**named, 'time': time}, options or TableOptions()
+        )
     step_s, values = _gridded(read)
     progress(0.3, 'judging')
+    used = (COMMAND, POSITION) if POSITION in values else (COMMAND, PROCESS, SET_POINT)
+    values = {role: values[role] for role in used if role in values}
     if POSITION in values:
         found = judge_position(values[COMMAND], values[POSITION], step_s)
-        used: tuple[str, ...] = (COMMAND, POSITION)
     else:
         found = judge_response(values[COMMAND], values[PROCESS], step_s, values.get(SET_POINT))
-        used = (COMMAND, PROCESS, SET_POINT)
     seconds = step_s * np.arange(len(values[COMMAND]), dtype=np.float64)
-    return LoopResult(
-        found,
-        {role: read.names[role] for role in used if role in values},
-        seconds,
-        {role: values[role] for role in used if role in values},
-    )
+    return LoopResult(found, {role: read.names[role] for role in values}, seconds, values)
 
 
 def _known(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
-def _gridded(read: LoopColumns) -> tuple[float, dict[str, FloatArray]]:
+def _gridded(read: loop_columns.LoopColumns) -> tuple[float, dict[str, FloatArray]]:
     """Return the median step in s and the columns on a grid of that step, NaN in missing rows."""
     times = read.time_ns
     if len(times) < 2:
@@ -190,16 +177,15 @@ def _gridded(read: LoopColumns) -> tuple[float, dict[str, FloatArray]]:
     return step / 1e9, out
 
 
-def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> LoopColumns:
+def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> loop_columns.LoopColumns:
     import pandas as pd
 
     names = [str(c) for c in frame.columns]
-    for theirs in (*named.values(), time):
-        if theirs and theirs not in names:
-            raise InputError(f"The DataFrame has no column '{theirs}'.")
-    guessed = roles_of(names, [''] * len(names))
+    if absent := [c for c in (*named.values(), time) if c and c not in names]:
+        raise InputError(f"The DataFrame has no column '{absent[0]}'.")
+    guessed = loop_columns.roles_of(names, [''] * len(names))
     chosen = {role: theirs for role, theirs in named.items() if theirs}
-    for role in ROLES:
+    for role in loop_columns.ROLES:
         behind = role in (POSITION, PROCESS) and {POSITION, PROCESS} & set(chosen)
         free = [names[k] for k in guessed.get(role, []) if names[k] not in chosen.values()]
         if role not in chosen and not behind and len(free) == 1:
@@ -213,16 +199,9 @@ def _from_dataframe(frame: Any, named: dict[str, str], time: str) -> LoopColumns
     column = frame[clock] if clock else frame.index
     if not clock and not isinstance(frame.index, pd.DatetimeIndex):
         raise InputError("The DataFrame has no column 'time', and its index holds no times.")
-    series = pd.Series(column).reset_index(drop=True)
-    if pd.api.types.is_numeric_dtype(series):
-        there = series.notna().to_numpy()
-        seconds = np.where(there, series.to_numpy(np.float64), 0.0)
-        time_ns = np.where(there, np.rint(seconds * 1e9), NEVER).astype(np.int64)
-    else:
-        stamps = pd.to_datetime(series, utc=True, errors='coerce')
-        time_ns = stamps.astype('datetime64[ns, UTC]').astype(np.int64).to_numpy()
+    time_ns, there = nanoseconds(column)
     values = {
         role: pd.to_numeric(frame[theirs], errors='coerce').to_numpy(np.float64)
         for role, theirs in chosen.items()
     }
-    return ordered(time_ns, values, chosen)
+    return loop_columns.ordered(np.where(there, time_ns, NEVER), values, chosen)

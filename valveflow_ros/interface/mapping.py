@@ -27,8 +27,7 @@ from valveflow_ros.signals.units import convert, known_units, units_of
 Answer = TypeVar('Answer')
 _TIMES = ('time', 'date')
 _BY_NAME = {name: info for info in SIGNALS for name in (info.topic, info.column)}
-_TABLE = {'time-zone': 'time_zone', 'date-order': 'date_order', 'decimal': 'decimal',
-          'sheet': 'sheet', 'max-unpacked': 'max_unpacked', 'period': 'period'}  # fmt: skip
+_TABLE = ('time-zone', 'date-order', 'decimal', 'sheet', 'max-unpacked', 'period')
 # Placeholder for a signal that is not named yet, used to find all further open questions.
 _STAND_IN = {
     'valve_opening': 50.0,
@@ -44,18 +43,10 @@ LOOKING_ON = 'looking for what else the table leaves open'
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One ``name=THEIRS[:unit]``.
+    """One ``name=THEIRS[:unit]``; the name is the topic of a signal, or 'time' or 'date'.
 
-    Attributes
-    ----------
-    name : str
-        The topic's name of a signal, or 'time' or 'date'.
-    theirs : str
-        Its name in the log.
-    unit : str
-        As written; empty means the engine's own unit.
-    whole : str
-        Everything after the equals sign: a column's name may itself contain a colon.
+    An empty unit means the engine's own. ``whole`` is everything after the equals sign: a column's
+    name may itself contain a colon.
     """
 
     name: str
@@ -100,13 +91,7 @@ class LogMapping:
         return {c.name: c.theirs if c.known else c.whole for c in self.columns.values()}
 
     def open_with(self, look: Callable[[dict[str, str]], Answer]) -> Answer:
-        """Return ``look(names)``; if it fails and a unit is unknown, the message names that unit.
-
-        Raises
-        ------
-        UsageError
-            ``look`` found no such column, and the unit of one is unknown.
-        """
+        """Return ``look(names)``; if it fails, `UsageError` names a unit that is unknown."""
         try:
             return look(self.names())
         except InputError as error:
@@ -133,22 +118,15 @@ class LogMapping:
 
 
 def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str) -> LogMapping:
-    """Read the user's specification of a log.
+    """Read the user's specification of a log; raises `UsageError`.
 
     Parameters
     ----------
-    columns : sequence of str
-        Each ``NAME=THEIRS[:UNIT]``.
-    constants : sequence of str
-        Each ``NAME=VALUE[:UNIT]``.
+    columns, constants : sequence of str
+        Each ``NAME=THEIRS[:UNIT]`` or ``NAME=VALUE[:UNIT]``.
     **table : str
         Format of a table: ``time_zone``, ``date_order``, ``decimal``, ``sheet``, ``max_unpacked``,
         ``period``.
-
-    Raises
-    ------
-    UsageError
-        An option has a wrong form, is given twice, or contradicts another.
     """
     found = LogMapping(table=table_options(table))
     for text in columns:
@@ -169,10 +147,8 @@ def read_mapping(columns: Sequence[str], constants: Sequence[str], **table: str)
 
 def table_options(said: Mapping[str, str]) -> TableOptions:
     """Return the options of a table by name; raises `UsageError`."""
-    options = AS_SEEN
     try:
-        for name, value in said.items():
-            options = replace(options, **{name: value.strip()})
+        options = replace(AS_SEEN, **{name: value.strip() for name, value in said.items()})
         zone_of(options.time_zone)
     except InputError as error:
         raise UsageError(str(error)) from None
@@ -242,13 +218,8 @@ def gather_refusals(
 ) -> Answer:
     """Return the result of ``look``; if it is refused, collect all open questions of the table.
 
-    If ``look`` is refused, ``again`` continues as if the user had answered, so that one message
-    contains all questions.
-
-    Raises
-    ------
-    RefusedError
-        Contains all refusals that would otherwise have come one after another.
+    ``again`` then continues as if the user had answered, so that one `RefusedError` contains all
+    questions that would otherwise have come one after another.
     """
     try:
         return look(mapping)
@@ -280,7 +251,7 @@ def _answered(mapping: LogMapping, remedies: Iterable[Remedy]) -> LogMapping:
     columns, constants, table = dict(mapping.columns), dict(mapping.constants), mapping.table
     for remedy in remedies:
         if remedy.option in _TABLE:
-            table = replace(table, **{_TABLE[remedy.option]: remedy.value})
+            table = replace(table, **{remedy.option.replace('-', '_'): remedy.value})
             continue
         if remedy.option == 'constant':
             name, value, _ = _constant(remedy.value)

@@ -5,9 +5,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from valveflow_ros.baselines.truth import Truth, read_truth
 from valveflow_ros.curve.characteristic import Characteristic
@@ -18,6 +18,7 @@ from valveflow_ros.errors import DataError, RecordingError, UsageError
 from valveflow_ros.interface.files import reason
 
 Model = Characteristic | ExtendedModel
+Read = TypeVar('Read', bound=Model)
 _MOST_BYTES = 50_000_000
 _CURVE, _EXTENDED = 'characteristic.json', 'extended_model.json'
 
@@ -50,20 +51,11 @@ def load_extended(path: str | Path) -> ExtendedModel:
 
 
 def load_model(path: str | Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Model:
-    """Return the characteristic or the extended model in a file.
+    """Return the characteristic or the extended model in a file; raises as `load_characteristic`.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file, or a folder with one of ``names`` in it.
-    names : tuple of str
-
-    Raises
-    ------
-    RecordingError
-        It cannot be read, or is no model that this version supports.
+    In a folder it is the first of ``names``.
     """
-    path = model_path(Path(path), names)
+    path = model_path(Path(path).expanduser(), names)
     raw = _read_json(path, 'a flow characteristic', 'flow characteristic')
     try:
         extended = isinstance(raw, dict) and raw.get('format') != FORMAT and is_model(raw)
@@ -81,39 +73,53 @@ def model_path(path: Path, names: tuple[str, ...] = (_CURVE, _EXTENDED)) -> Path
     return next((path / name for name in names if (path / name).is_file()), path)
 
 
-def with_exponent(model: Model, given: Mapping[str, Any], name: object) -> dict[str, Any]:
-    """Return parameters with the pressure exponent of a model, unless its axis is the opening.
+def taken_model(
+    model: Read | str | Path | None,
+    parameters: Mapping[str, Any] | None,
+    load: Callable[[str | Path], Read],
+) -> tuple[Read | None, dict[str, Any]]:
+    """Return a model, read if a path is given, and the parameters with its pressure exponent.
 
     Raises
     ------
+    RecordingError
+        The file cannot be read.
     UsageError
-        Another exponent is given; ``name`` is the name of the model in the message.
+        The parameters give another exponent. A curve over the opening has none.
     """
-    if model.pressure_exponent == 0.0:
-        return dict(given)
+    given = dict(parameters or {})
+    if model is None:
+        return None, given
+    name, read = (model, load(model)) if isinstance(model, str | Path) else ('The model', model)
+    exponent = read.pressure_exponent
+    if exponent == 0.0:
+        return read, given
     wanted = given.get('pressure_exponent')
-    if wanted is not None and abs(float(wanted) - model.pressure_exponent) > 1e-9:
+    if wanted is not None and abs(float(wanted) - exponent) > 1e-9:
         raise UsageError(
-            f'{name} is a curve over V p^{model.pressure_exponent:g}, but the parameter '
-            f'pressure_exponent is set to {float(wanted):g}: leave it out, the model decides.'
+            f'{name} is a curve over V p^{exponent:g}, but the parameter pressure_exponent is set '
+            f'to {float(wanted):g}: leave it out, the model decides.'
         )
-    return {**given, 'pressure_exponent': model.pressure_exponent}
+    return read, {**given, 'pressure_exponent': exponent}
 
 
-def check_output(model: Model, unit: str, name: object) -> None:
-    """Check that the output of a model has the same unit as that of the log.
+def taken_curve(curve: Characteristic | str | Path | None) -> Characteristic | None:
+    """Return a curve, read if a path is given; raises as `load_characteristic`."""
+    return load_characteristic(curve) if isinstance(curve, str | Path) else curve
 
-    Raises
-    ------
-    UsageError
-        The units differ; ``name`` is the name of the model in the message.
+
+def check_output(unit: str, **models: Model | None) -> None:
+    """Raise `UsageError` if the output of a model has another unit than that of the log.
+
+    The models are given by the last word of their name in the message: ``model`` is 'The model'.
     """
-    if model.output_unit != unit:
-        raise UsageError(
-            f'{name} is a curve of an output in {model.output_unit}, and that of the log is in '
-            f'{unit}: name its unit with --column generated_power=THEIRS:{model.output_unit}, or '
-            'leave the curve out.'
-        )
+    for name, model in models.items():
+        if model is not None and model.output_unit != unit:
+            raise UsageError(
+                f'The {name.replace("_", " ")} is a curve of an output in {model.output_unit}, '
+                f'and that of the log is in {unit}: name its unit with --column '
+                f'generated_power=THEIRS:{model.output_unit}, or leave the curve out.'
+            )
 
 
 def load_truth(path: str | Path) -> Truth:

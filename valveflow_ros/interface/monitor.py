@@ -7,75 +7,49 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.shift import minute
-from valveflow_ros.diagnosis.causes import check_covariates
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import diagnose_window
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import Result
+from valveflow_ros.interface.files import Result, as_text
 from valveflow_ros.interface.logs import Log, as_log
-from valveflow_ros.interface.models import load_characteristic, load_extended, with_exponent
-from valveflow_ros.interface.observation import Covariates, check_signals
+from valveflow_ros.interface.models import load_extended, taken_curve, taken_model
+from valveflow_ros.interface.observation import Covariates, check_signals, taken_covariates
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import LogContents
+from valveflow_ros.monitoring import events as told
 from valveflow_ros.monitoring.alarm_state import AlarmChange, AlarmState
 from valveflow_ros.monitoring.alarms import ResidualAlarm, ShiftAlarm
 from valveflow_ros.monitoring.diagnosis_requests import onset_ns
-from valveflow_ros.monitoring.events import (
-    CurveAdopted,
-    Diagnosed,
-    Event,
-    JournalEntry,
-    JournalKind,
-    ReferenceSet,
-)
+from valveflow_ros.monitoring.events import Event, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import Wear
-from valveflow_ros.parameters import Settings, covariate_columns
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SampleTable
+from valveflow_ros.report import history as reported
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words
 from valveflow_ros.report.figure import Figure
-from valveflow_ros.report.history import (
-    AlarmMoment,
-    CurveMoment,
-    DiagnosisMoment,
-    History,
-    Moment,
-    alarms_of,
-    evidence_figure,
-    history_of,
-    history_sections,
-    largest_evidence,
-    moment_of,
-    standing_spans,
-)
-from valveflow_ros.report.page import Page, Section, folded, notice, paragraph, table, text
 from valveflow_ros.report.terminal.board import ALARM, CURVE, DIAGNOSIS
-from valveflow_ros.report.words import (
-    VERDICT_WORDS,
-    advice,
-    counted,
-    duration,
-    moment,
-    percent,
-    signed,
-)
+from valveflow_ros.report.words import counted, moment
 from valveflow_ros.signals.align import Aligner, aligned_blocks
 
 # Switches the diagnoses off: each takes as long as `diagnose` over the window.
 _NO_DIAGNOSIS = {'diagnosis_on_mismatch': False, 'diagnosis_hour': -1}
 _RESIDUAL = ResidualAlarm.NAME
+Kind = TypeVar('Kind')
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +82,20 @@ class MonitorResult(Result):
         """Return the unit of the output."""
         return self.settings.output_unit
 
+    def _events(self, kind: type[Kind]) -> list[Kind]:
+        return [e for e in self.events if isinstance(e, kind)]
+
+    def _times(self, kind: JournalKind) -> list[int]:
+        return [e.time_ns for e in self._events(told.JournalEntry) if e.kind == kind]
+
+    @property
+    def _references(self) -> list[Characteristic]:
+        return [e.characteristic for e in self._events(told.ReferenceSet)]
+
+    @property
+    def _diagnosed(self) -> list[told.Diagnosed]:
+        return [e for e in self._events(told.Diagnosed) if e.content]
+
     @property
     def wear_words(self) -> str:
         """Return a sentence on the slow change of the curve; empty while it is unknown."""
@@ -115,24 +103,23 @@ class MonitorResult(Result):
             return ''
         since, unit = moment(self.wear.since_ns), self.output_unit
         return (
-            f'Since {since} the curve has changed slowly by {signed(self.wear.total_mw)} {unit}, '
-            f'{signed(self.wear.mw_per_month, 2)} {unit} a month.'
+            f'Since {since} the curve has changed slowly by {words.signed(self.wear.total_mw)} '
+            f'{unit}, {words.signed(self.wear.mw_per_month, 2)} {unit} a month.'
         )
 
     @property
     def reference_words(self) -> str:
         """Return a sentence on which curve is the reference, or why there is none."""
-        references = [e.characteristic for e in self.events if isinstance(e, ReferenceSet)]
-        if references:
+        if references := self._references:
             first_id, curve = references[0].model_id, references[-1]
-            first, last = curve.source.window_start_ns, curve.source.window_end_ns
+            data = words.period(curve.source.window_start_ns, curve.source.window_end_ns)
             followed = (
                 '' if curve.model_id == first_id
                 else f' It followed the first reference, curve {first_id}, within the wear budget.'
             )  # fmt: skip
             return (
                 f'The reference that later curves are compared with is curve {curve.model_id}, '
-                f'from data of {moment(first)} to {moment(last)}.{followed}'
+                f'from data of {data}.{followed}'
             )
         days = self.settings.real('reference_after')
         return (
@@ -143,37 +130,27 @@ class MonitorResult(Result):
     @property
     def curves(self) -> list[tuple[int, Characteristic]]:
         """Return each curve with the time (ns) of the last row before its adoption."""
-        adopted = [e.characteristic for e in self.events if isinstance(e, CurveAdopted)]
-        times = [
-            e.time_ns
-            for e in self.events
-            if isinstance(e, JournalEntry) and e.kind == JournalKind.FIT_ADOPTED
-        ]
-        return list(zip(times, adopted, strict=True))
+        adopted = [e.characteristic for e in self._events(told.CurveAdopted)]
+        return list(zip(self._times(JournalKind.FIT_ADOPTED), adopted, strict=True))
 
     @property
     def alarms(self) -> list[AlarmChange]:
         """Return the changes of the alarms' states, without repetitions."""
-        return [c for c in self._alarm_changes if c.state != c.previous]
-
-    @property
-    def _alarm_changes(self) -> list[AlarmChange]:
-        return [e for e in self.events if isinstance(e, AlarmChange)]
+        return [c for c in self._events(AlarmChange) if c.state != c.previous]
 
     @property
     def diagnoses(self) -> list[tuple[int, dict[str, Any]]]:
         """Return each diagnosis: the time (ns) of its newest row, and the content of its JSON."""
-        ended = [e for e in self.events if isinstance(e, Diagnosed) and e.content]
-        return [(e.task.window_end_ns, json.loads(e.content)) for e in ended]
+        return [(e.task.window_end_ns, json.loads(e.content)) for e in self._diagnosed]
 
     def predictions(self) -> dict[str, IntArray | FloatArray]:
         """Return the predictions as arrays of shape (rows,), named as in `PredictionBlock`."""
         names = ('time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
                  'average_mw', 'evidence', 'shift_mw', 'state')  # fmt: skip
-        return self._predicted(names)
+        return self._predicted(*names)
 
-    def _predicted(self, names: Sequence[str]) -> dict[str, Any]:
-        blocks = [e for e in self.events if isinstance(e, PredictionBlock)]
+    def _predicted(self, *names: str) -> dict[str, Any]:
+        blocks = self._events(PredictionBlock)
         return {n: np.concatenate([getattr(b, n) for b in blocks]) for n in names if blocks}
 
     def _judged(self) -> tuple[IntArray, FloatArray, FloatArray] | None:
@@ -181,7 +158,7 @@ class MonitorResult(Result):
 
         The result is in the order of time, and None if nothing was judged.
         """
-        rows = self._predicted(('time_ns', 'residual_mw', 'average_mw', 'evidence'))
+        rows = self._predicted('time_ns', 'residual_mw', 'average_mw', 'evidence')
         if not rows:
             return None
         order = np.argsort(rows['time_ns'], kind='stable')  # the clock may have gone back
@@ -201,7 +178,8 @@ class MonitorResult(Result):
         if judged is None:
             return None
         time_ns, _, evidence = judged
-        return largest_evidence(time_ns, evidence, standing_spans(self.history(), _RESIDUAL))
+        spans = reported.standing_spans(self.history(), _RESIDUAL)
+        return reported.largest_evidence(time_ns, evidence, spans)
 
     @property
     def evidence_words(self) -> str:
@@ -210,94 +188,92 @@ class MonitorResult(Result):
         if largest is None:
             return ''
         at, share = largest
-        delay = duration(self.settings.real('alarm_on_delay'))
+        delay = words.duration(self.settings.real('alarm_on_delay'))
         short = (
             f' It was beyond the limit, but not for alarm_on_delay ({delay}).'
             if share > 1.0 else ''
         )  # fmt: skip
         return (
             f'Outside alarms, the evidence of the residual alarm reached at most '
-            f'{percent(share)} of its limit, at {moment(at)}.{short}'
+            f'{words.percent(share)} of its limit, at {moment(at)}.{short}'
         )
 
-    def history(self) -> History:
+    def history(self) -> reported.History:
         """Return curves, alarms and diagnoses as the reports show them."""
-        return History(
+        return reported.History(
             self.start_ns,
             self.end_ns,
             tuple(_curve_moment(at, c) for at, c in self.curves),
-            alarms_of(
-                AlarmMoment(a.time_ns, a.name, a.state, a.sentence, a.state == a.previous)
-                for a in self._alarm_changes
+            reported.alarms_of(
+                reported.AlarmMoment(a.time_ns, a.name, a.state, a.sentence, a.state == a.previous)
+                for a in self._events(AlarmChange)
             ),
-            tuple(DiagnosisMoment(at, d['sentence']) for at, d in self.diagnoses),
+            tuple(reported.DiagnosisMoment(at, d['sentence']) for at, d in self.diagnoses),
         )
 
-    def page(self) -> Page:
+    def page(self) -> html.Page:
         """Return the report: the changes of the curve, and the outputs of the monitor."""
-        lead = paragraph(text(self.source), 'where')
-        lead += paragraph(f'{moment(self.start_ns)} to {moment(self.end_ns)}', 'where')
-        lead += paragraph(text(f'{self.reference_words} {self.wear_words}'), 'where')
-        sections = [Section('The answer', self._answer()), *self._nearness()]
-        sections += history_sections(self.history())
+        about = f'{self.reference_words} {self.wear_words}'
+        lead = ''.join(
+            html.paragraph(html.text(line), 'where')
+            for line in (self.source, words.period(self.start_ns, self.end_ns), about)
+        )
+        sections = [html.Section('The answer', self._answer()), *self._nearness()]
+        sections += reported.history_sections(self.history())
         foot = (
-            f'Made by valveflow {text(__version__)}. The same numbers, unrounded, stand in '
+            f'Made by valveflow {html.text(__version__)}. The same numbers, unrounded, stand in '
             'monitor.json beside this page.'
         )
-        return Page('What the monitor would have told', lead, sections, foot, self.verb)
+        return html.Page('What the monitor would have told', lead, sections, foot, self.verb)
 
-    def _nearness(self) -> list[Section]:
+    def _nearness(self) -> list[html.Section]:
         """Return the section on how near the residual came to an alarm; none if not judged."""
         judged = self._judged()
         if judged is None:
             return []
-        time_ns, average_mw, evidence = judged
-        figure = evidence_figure(
-            time_ns, average_mw, evidence, standing_spans(self.history(), _RESIDUAL),
+        figure = reported.evidence_figure(
+            *judged, reported.standing_spans(self.history(), _RESIDUAL),
             round(self.settings.real('sample_period') * NS_PER_S),
             self.settings.real('alarm_limit'),
         )  # fmt: skip
-        words = self.evidence_words
-        parts: list[str | Figure] = [paragraph(words)] if words else []
-        return [Section('How near the residual came to an alarm', [*parts, figure])]
+        words_too = [html.paragraph(self.evidence_words)] if self.evidence_words else []
+        return [html.Section('How near the residual came to an alarm', [*words_too, figure])]
 
     def _answer(self) -> list[str | Figure]:
         """Return the state at the end, its reasons as far as known, and every diagnosis."""
         alarms, curves = self._alarms_json(), len(self.curves)
         parts: list[str | Figure] = [
-            notice(f'<b>{text(name.replace("_", " "))}</b>: {text(sentence)}')
+            html.notice(f'<b>{html.text(name.replace("_", " "))}</b>: {html.text(sentence)}')
             for name, sentence in self.standing
         ]
         if not parts:
             gone = f' {counted(len(alarms), "alarm")} came and went.' if alarms else ''
             known = 'No alarm stands at the end.' if curves else 'No new curve was found.'
-            parts.append(paragraph(known + gone, '' if gone or not curves else 'good'))
+            parts.append(html.paragraph(known + gone, '' if gone or not curves else 'good'))
         if not self.diagnoses:
             return parts
-        parts += [paragraph(text(told)) for told in self.named]
-        parts.append(paragraph(f'The last diagnosis: {text(self.diagnoses[-1][1]["sentence"])}'))
-        parts += [paragraph(text(told)) for told in self.advice]
+        last = f'The last diagnosis: {self.diagnoses[-1][1]["sentence"]}'
+        parts += [html.paragraph(html.text(line)) for line in (*self.named, last, *self.advice)]
         rows = [
-            [moment(at), VERDICT_WORDS[d['verdict']], text(d['sentence'])]
+            [moment(at), words.VERDICT_WORDS[d['verdict']], html.text(d['sentence'])]
             for at, d in self.diagnoses
         ]
-        body = table(['data up to', 'verdict', 'what it said'], rows, sentences=True)
-        return [*parts, folded(counted(len(rows), 'diagnosis', 'diagnoses'), body)]
+        body = html.table(['data up to', 'verdict', 'what it said'], rows, sentences=True)
+        return [*parts, html.folded(counted(len(rows), 'diagnosis', 'diagnoses'), body)]
 
     @property
     def standing(self) -> list[tuple[str, str]]:
         """Return the name of each alarm that stands at the end, and a sentence on it."""
-        ended = [e.content for e in self.events if isinstance(e, Diagnosed) and e.content]
-        found_ns = onset_ns(ended[-1]) if ended else None
-        told = []
+        found_ns = onset_ns(self._diagnosed[-1].content) if self._diagnosed else None
+        standing = []
         for alarm in self._alarms_json():
             if alarm['cleared'] is None:
                 name, sentence = alarm['name'], alarm['sentence']
                 # The curve alone often cannot tell when it moved.
                 if name == ShiftAlarm.NAME and found_ns and found_ns <= alarm['raised']:
                     sentence += f' The diagnosis dates it to about {minute(found_ns)}.'
-                told.append((name, sentence))
-        return told
+                standing.append((name, sentence))
+        return standing
 
     @property
     def named(self) -> list[str]:
@@ -320,24 +296,19 @@ class MonitorResult(Result):
         # A covariate is no fault: there is nothing to do.
         faults = [[c for c in d['causes'] if c['to_do']] for _, d in self.diagnoses]
         last: list[dict[str, Any]] = next((causes for causes in reversed(faults) if causes), [])
-        return [advice(c['name'], c['meaning'], c['to_do']) for c in last]
+        return [words.advice(c['name'], c['meaning'], c['to_do']) for c in last]
 
     def texts(self) -> dict[str, str]:
         """Return ``monitor.json``; times are ns since 1970.
 
         ``largest_evidence`` is that of the residual alarm outside alarms, as a share of its limit.
         """
-        largest = self.largest_evidence
+        largest, references = self.largest_evidence, self._references
         content = {
             'format': 'valveflow/monitor',
             'version': 1,
             'alarms': self._alarms_json(),
-            'largest_evidence': None
-            if largest is None
-            else {
-                'time': largest[0],
-                'share': largest[1],
-            },
+            'largest_evidence': largest and {'time': largest[0], 'share': largest[1]},
             'curves': [
                 {
                     'adopted': at,
@@ -355,27 +326,21 @@ class MonitorResult(Result):
                 }
                 for at, d in self.diagnoses
             ],
-            'reference': self._reference_json(),
-            'wear': None if self.wear is None else self.wear._asdict(),
+            # A reference that is set before the first row has no time.
+            'reference': {
+                'set': max(self._times(JournalKind.SET_REFERENCE)[-1], self.start_ns),
+                'model_id': references[-1].model_id,
+            }
+            if references
+            else None,
+            'wear': self.wear and self.wear._asdict(),
         }
-        return {'monitor.json': json.dumps(content, indent=2, allow_nan=False) + '\n'}
-
-    def _reference_json(self) -> dict[str, Any] | None:
-        references = [e.characteristic for e in self.events if isinstance(e, ReferenceSet)]
-        times = [
-            e.time_ns
-            for e in self.events
-            if isinstance(e, JournalEntry) and e.kind == JournalKind.SET_REFERENCE
-        ]
-        if not references:
-            return None
-        # An alarm that is set before the first row has no time.
-        return {'set': max(times[-1], self.start_ns), 'model_id': references[-1].model_id}
+        return {'monitor.json': as_text(content)}
 
     def _alarms_json(self) -> list[dict[str, Any]]:
         """Return one entry for each rise of an alarm, with the last report on it."""
         found: dict[tuple[str, int], dict[str, Any]] = {}
-        for change in self._alarm_changes:
+        for change in self._events(AlarmChange):
             stands = change.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
             key = change.name, change.occurrence
             if stands:
@@ -431,22 +396,14 @@ def monitor(
     """
     # A parameter file of `config init` has all parameters, so it must not decide.
     given = {**(parameters or {}), **({} if diagnose else _NO_DIAGNOSIS)}
-    model = model or given.get('model_file') or None
-    if model is not None:
-        name = 'The model' if isinstance(model, ExtendedModel) else model
-        model = model if isinstance(model, ExtendedModel) else load_extended(model)
-        given = with_exponent(model, given, name)
-    reference = reference or given.get('reference_file') or None
-    if reference is not None and not isinstance(reference, Characteristic):
-        reference = load_characteristic(reference)
+    model, given = taken_model(model or given.get('model_file') or None, given, load_extended)
+    reference = taken_curve(reference or given.get('reference_file') or None)
+    covariates = taken_covariates(covariates, given)
     log = as_log(log, progress)
-    if covariates is None:
-        covariates = covariate_columns(str(given.get('covariates', '')).split())
-    check_covariates(covariates)
     # The window is as long as that of a live monitor, independent of the length of the log.
-    given, told = log.parameters(given)
+    given, units = log.parameters(given)
     settings, notes = settings_for(log.steps(), 0.0, given, live=True)
-    for sentence in (*told, *notes):
+    for sentence in (*units, *notes):
         progress.say(sentence)
     columns = Covariates.of(log, model, covariates)
     corrector = columns.corrector_of(model, settings)
@@ -483,28 +440,28 @@ def _progress_by_time(log: Log, progress: Progress) -> Callable[[int, str], None
     return tell
 
 
-def _curve_moment(time_ns: int, c: Characteristic) -> CurveMoment:
+def _curve_moment(time_ns: int, c: Characteristic) -> reported.CurveMoment:
     ends = np.array(c.breakpoint_intervals, dtype=np.float64).reshape(-1, 2)
-    return CurveMoment(
+    return reported.CurveMoment(
         time_ns, c.model_id, c.pressure_exponent, c.breakpoints, c.values(), ends[:, 0],
         ends[:, 1], c.residuals.rmse_mw,
     )  # fmt: skip
 
 
-def recorded_history(log: LogContents) -> History | None:
+def recorded_history(log: LogContents) -> reported.History | None:
     """Return the outputs of a monitor; None if the log is no monitor's recording.
 
     Topics are found by their type because the node may have any name. A message that
     cannot be decoded is reported in the notes.
     """
     notes: list[str] = []
-    told = [m for kind in (CURVE, ALARM, DIAGNOSIS) for m in _all(log, kind, notes)]
+    moments = [m for kind in (CURVE, ALARM, DIAGNOSIS) for m in _all(log, kind, notes)]
     readings = log.readings.time_ns
     ends = [int(readings.min()), int(readings.max())] if len(log.readings) else []
-    return history_of(told, ends, notes)
+    return reported.history_of(moments, ends, notes)
 
 
-def _all(log: LogContents, kind: str, notes: list[str]) -> list[Moment]:
+def _all(log: LogContents, kind: str, notes: list[str]) -> list[reported.Moment]:
     """Return the messages of one type; of several topics only the first is used."""
     topics = sorted(t.name for t in log.topics.values() if t.type == kind and t.count)
     if not topics:
@@ -516,11 +473,11 @@ def _all(log: LogContents, kind: str, notes: list[str]) -> list[Moment]:
         )
     try:
         decoder = log.decoder(topics[0])
-        told = (
-            moment_of(kind, decoder.decode(message.data))
+        found = (
+            reported.moment_of(kind, decoder.decode(message.data))
             for message in log.iter_messages([topics[0]])
         )
-        return [moment for moment in told if moment is not None]
+        return [one for one in found if one is not None]
     except (RecordingError, KeyError, TypeError, ValueError) as error:
         lacks = f'it lacks {error}.' if isinstance(error, KeyError) else str(error)
         notes.append(f'What the monitor published on {topics[0]} cannot be shown: {lacks}')

@@ -13,6 +13,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis.causes import check_covariates
 from valveflow_ros.diagnosis.corrector import corrector_of, covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space, counted
@@ -20,13 +21,14 @@ from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
 from valveflow_ros.fit.task import COARSE_STEP_S, FitTask
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.logs import Log, Series, read_covariate
+from valveflow_ros.interface.plausibility import selected
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.monitoring.events import FitRequested
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_aligned
 from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.numerics import read_ahead
-from valveflow_ros.parameters import Settings
+from valveflow_ros.parameters import Settings, covariate_columns
 from valveflow_ros.records import (
     NS_PER_S,
     SIGNALS,
@@ -57,10 +59,8 @@ class Observed:
         The rows in the engine's window; if the clock was set back, without the rows before that.
     rows : int64 (n,)
         Their indices among all rows of the log.
-    segments : tuple of SpecialSegment
     counts : dict
         ``{topic: {reason: readings}}``.
-    task : FitTask
     clock_resets : int
         Number of times the clock was set back.
     """
@@ -101,13 +101,7 @@ class Observed:
 def settings_of(
     log: Log, given: Mapping[str, Any], progress: Progress, constants: bool = True
 ) -> tuple[Settings, list[str]]:
-    """Return the settings for a log, and report what was adapted.
-
-    Raises
-    ------
-    ParameterError
-        Values contradict each other.
-    """
+    """Return the settings for a log, and report what was adapted; raises `ParameterError`."""
     given, told = log.parameters(given)
     settings, notes = settings_for(log.steps(), log.span_s, given, held=log.updates is not None)
     notes = [*told, *notes]
@@ -131,12 +125,7 @@ def observe(
     """Feed readings to a monitor and request a fit.
 
     With a ``corrector`` its causes are removed from the rows before all other steps; it may need
-    ``covariates``.
-
-    Raises
-    ------
-    DataError
-        The data do not suffice for a fit; the message says what is missing.
+    ``covariates``. Raises `DataError`, which says what is missing for a fit.
     """
     aligner, monitor = Aligner(settings), Monitor(settings)
     tables: list[SampleTable] = []
@@ -188,13 +177,7 @@ def observe_log(
 
 
 class Covariates:
-    """The further columns of a log that the rows need.
-
-    Parameters
-    ----------
-    series : dict
-        Column by the name of the covariate.
-    """
+    """The further columns of a log that the rows need, by the name of the covariate."""
 
     def __init__(self, series: dict[str, Series]) -> None:
         self._series = series
@@ -204,13 +187,7 @@ class Covariates:
     def of(
         cls, log: Log, model: ExtendedModel | None, said: Mapping[str, str] | None = None
     ) -> Covariates:
-        """Read the columns that a user names, and those that causes of a model follow.
-
-        Raises
-        ------
-        InputError
-            The log has no such column.
-        """
+        """Read the columns that a user names, and those that causes of a model follow."""
         own = {n: f'{c.column}:{c.unit}' for n, c in covariates_of(model).items()}
         wanted = {**own, **(said or {})}
         return cls({name: read_covariate(log, name, theirs) for name, theirs in wanted.items()})
@@ -230,34 +207,30 @@ class Covariates:
             yield replace(block, table=replace(block.table, covariates=values))
 
 
-def cut_in_two(log: Log, block_s: float) -> tuple[Log, Log]:
-    """Return the first two thirds of a log and the last third, cut at a block boundary.
-
-    Parameters
-    ----------
-    log : Log
-    block_s : float
-        Length of the segmenter's blocks.
-    """
+def cut_in_two(log: Log, block_s: float) -> tuple[Log, ...]:
+    """Return the first two thirds of a log and the last third, cut at the end of a block."""
     r = log.readings
     first, last = int(r.time_ns.min()), int(r.time_ns.max())
     block = max(1, round(block_s * NS_PER_S))
     cut = first + int(LEARN_SHARE * (last - first)) // block * block
+    early = r.time_ns < cut
+    return tuple(
+        replace(log, readings=selected(r, rows), updates=None) for rows in (early, ~early)
+    )
 
-    def part(mask: Any) -> Log:
-        kept = Readings(r.time_ns[mask], r.signal[mask], r.value[mask], r.quality[mask])
-        return replace(log, readings=kept, updates=None)
 
-    return part(r.time_ns < cut), part(r.time_ns >= cut)
+def taken_covariates(
+    said: Mapping[str, str] | None, given: Mapping[str, Any]
+) -> Mapping[str, str]:
+    """Return the columns to try as causes; by default those of the parameter ``covariates``."""
+    if said is None:
+        said = covariate_columns(str(given.get('covariates', '')).split())
+    check_covariates(said)
+    return said
 
 
 def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None:
-    """Raise `DataError` if a required signal has no usable value; the message gives the reason.
-
-    Raises
-    ------
-    DataError
-    """
+    """Raise `DataError` if a required signal has no usable value; the message gives the reason."""
     for info in _NEEDED:
         if len(table) and np.isfinite(table.column(info.signal)).any():
             continue

@@ -68,18 +68,8 @@ class Fitted(dict[str, FittedValue]):
 def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT) -> Fitted:
     """Return the parameters of the monitor that can be estimated from a log.
 
-    Parameters
-    ----------
-    log : Log, str, Path or pandas.DataFrame
-        The result of `open_log`, or anything that it opens.
-    unit_tag : str
-        Tag of the unit.
-    progress : Progress
-
-    Raises
-    ------
-    DataError
-        The log contains no readings.
+    The log is the result of `open_log`, or anything that it opens. Raises `DataError` if it has
+    no readings.
     """
     log = as_log(log, progress)
     if not len(log.readings):
@@ -89,7 +79,11 @@ def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT)
         found.put('unit_tag', unit_tag, 'as you said')
     _units(log, found)
     _steps(log, found)
-    settings = Settings({**found.changes(), **_window(log, found), **ONE_FIT})
+    changes = found.changes()
+    # A window for the whole log; that of the monitor is not changed.
+    adapted = fitting(log.steps(), log.span_s, changes)
+    window = {name: value for name, value in adapted.items() if name == 'window_days'}
+    settings = Settings({**changes, **window, **ONE_FIT})
     monitor = Monitor(settings)
     for aligned in aligned_blocks(Aligner(settings), log.readings, progress, 'finding segments'):
         feed_aligned(monitor, aligned)
@@ -128,12 +122,6 @@ def _steps(log: Log, found: Fitted) -> None:
             found.put(name, adapted[name], f'the log has a value every {duration(step)}')
 
 
-def _window(log: Log, found: Fitted) -> dict[str, float]:
-    """Return a window for the whole log; the monitor's own window is not changed."""
-    adapted = fitting(log.steps(), log.span_s, found.changes())
-    return {name: value for name, value in adapted.items() if name == 'window_days'}
-
-
 def _noise(monitor: Monitor, found: Fitted) -> None:
     level = monitor.noise()
     if not level.learnt:
@@ -166,12 +154,10 @@ def _dynamics(monitor: Monitor, found: Fitted, progress: Progress) -> None:
 
 
 def _largest(curve: Characteristic, found: Fitted) -> None:
-    for name, what, found_here in (
-        ('time_constant', 'time constant',
-         [(d.time_constant_s, d.time_constant_stderr_s) for d in curve.dynamics]),
-        ('delay', 'delay', [(d.delay_s, d.delay_stderr_s) for d in curve.dynamics]),
-    ):  # fmt: skip
-        known = [pair for pair in found_here if not pair[1] > pair[0]]
+    for name in ('time_constant', 'delay'):
+        what = name.replace('_', ' ')
+        pairs = [(getattr(d, f'{name}_s'), getattr(d, f'{name}_stderr_s')) for d in curve.dynamics]
+        known = [pair for pair in pairs if not pair[1] > pair[0]]
         if not known:
             found.left.append(f'{name} is left as it is: the {what} is not known from the log.')
             continue
@@ -189,17 +175,7 @@ def _largest(curve: Characteristic, found: Fitted) -> None:
 def parameter_file(source: str, found: Fitted) -> str:
     """Return the text of a ROS 2 parameter file that is valid for any node name.
 
-    Parameters
-    ----------
-    source : str
-        Name of the log.
-    found : Fitted
-        Parameters estimated from the log.
-
-    Raises
-    ------
-    ParameterError
-        Values contradict each other.
+    ``source`` is the name of the log. Raises `ParameterError` if values contradict each other.
     """
     values = found.changes()
     Settings(values)

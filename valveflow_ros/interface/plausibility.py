@@ -6,14 +6,24 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.logs.tables.match import choosing, option
-from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError
+from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
 from valveflow_ros.parameters import PARAMETERS, Settings
-from valveflow_ros.records import FLOW_UNITS, SIGNALS, FloatArray, Quality, Readings, Signal
+from valveflow_ros.records import (
+    FLOW_UNITS,
+    SIGNALS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Quality,
+    Readings,
+    Signal,
+)
 from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, better_units, unit_of
 
 # A pressure must be positive; the temperature is absolute zero.
@@ -29,16 +39,13 @@ class Doubt:
 
     Attributes
     ----------
-    signal : Signal
     impossible : float
         Fraction of its values that the engine will reject.
     looks_like : str
         A unit in which the values are usual, empty if there is none; of several units the one
-        that brings the values nearest to the middle of the usual range.
+        that brings the values nearest to the middle of the usual range. ``also`` has the others.
     sentence : str
         The message for the user, without the option that solves the problem.
-    also : tuple of str
-        Further units in which the values are usual.
     other : bool
         In the unit that was told, the values are usual for another quantity: it is rather the
         column that is wrong than the unit.
@@ -64,6 +71,13 @@ class Doubt:
             )
         return f'{self.sentence} If so, add {" or ".join(chosen)}'
 
+    def remedy(self, theirs: str) -> Remedy:
+        """Return the option that helps, with a placeholder if the column is wrong."""
+        topic = SIGNALS[self.signal].topic
+        if self.other or not self.looks_like:
+            return choosing(topic, THEIRS)
+        return choosing(topic, theirs, self.looks_like)
+
 
 def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
     """Return the range outside which a value is rejected."""
@@ -73,13 +87,13 @@ def limits(signal: Signal, settings: Settings) -> tuple[float, float]:
 
 def limits_beside_steam(
     units: Mapping[Signal, str], constants: Mapping[Signal, float]
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Return the limits of values, as parameters, that differ from those of a steam unit.
 
     A flow may be of any fluid and a pressure difference may be small. A temperature that the
     user gives as a constant is accepted.
     """
-    found: dict[str, float] = {}
+    found: dict[str, Any] = {}
     if units.get(Signal.MAIN_STEAM_PRESSURE) in DIFFERENCES:
         found['main_steam_pressure_low'] = _LEAST_MPA
     if (told := constants.get(Signal.MAIN_STEAM_TEMPERATURE)) is not None:
@@ -89,8 +103,6 @@ def limits_beside_steam(
         names = ('main_steam_pressure', 'main_steam_temperature', 'generated_power')
         for name in names:
             low, high = PARAMETERS[f'{name}_low'].low, PARAMETERS[f'{name}_high'].high
-            assert low is not None
-            assert high is not None
             found |= {f'{name}_low': low, f'{name}_high': high}
         found['main_steam_pressure_low'] = _LEAST_MPA
     return found
@@ -101,16 +113,8 @@ def doubt(
 ) -> Doubt | None:
     """Check the values of one signal; return None if they are plausible.
 
-    Parameters
-    ----------
-    written : float64 (n,)
-        Values in the unit of the log.
-    unit : str
-        The assumed unit of the values.
-    settings : Settings
-        Settings with the limits of possible values.
-    steam : bool
-        Also expect the usual ranges of a steam unit.
+    ``written`` are in ``unit``, that of the log; ``settings`` hold the limits of possible values;
+    ``steam``: also expect the usual ranges of a steam unit.
     """
     written = written[np.isfinite(written)]
     if not len(written):
@@ -151,27 +155,23 @@ def doubt(
 def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal, str]) -> None:
     """Refuse a table if all values of a signal are impossible, or a unit is surely wrong.
 
-    A unit is surely wrong if most values are impossible in it and usual in another unit.
-
-    Raises
-    ------
-    RefusedError
-        Contains the options that would help.
+    A unit is surely wrong if most values are impossible in it and usual in another unit. Raises
+    `RefusedError` with the options that would help.
     """
     for found in doubts:
         lost = SIGNALS[found.signal].required and found.impossible >= 1.0
         if not lost and not (found.looks_like and found.impossible > _MOST):
             continue
         topic, theirs = SIGNALS[found.signal].topic, names[found.signal]
-        said, remedy = found.advice(theirs), choosing(topic, theirs, found.looks_like)
+        said = found.advice(theirs)
         if not found.looks_like:
             said = (
                 f'{said.removesuffix(".")}; name the right column with --column '
                 f'{topic}={THEIRS}[:unit], or give --constant {topic}=VALUE'
             )
-            remedy = choosing(topic, THEIRS)
-        remedy = choosing(topic, THEIRS) if found.other else remedy
-        raise RefusedError(path, f"'{theirs}' is taken for {said}", [remedy], last=True)
+        raise RefusedError(
+            path, f"'{theirs}' is taken for {said}", [found.remedy(theirs)], last=True
+        )
 
 
 def refuse_guesses(
@@ -179,27 +179,19 @@ def refuse_guesses(
 ) -> None:
     """Refuse columns that were found by their names and whose values contradict this.
 
-    Raises
-    ------
-    RefusedError
-        Contains the options that would help.
+    Raises `RefusedError` with the options that would help.
     """
     problems, remedies = [], []
     for found in doubts:
         if found.signal in guessed and (found.looks_like or found.impossible > _MOST):
-            theirs = names[found.signal]
-            topic = SIGNALS[found.signal].topic
-            said = found.advice(theirs)
-            remedy = choosing(topic, theirs, found.looks_like)
+            topic, theirs = SIGNALS[found.signal].topic, names[found.signal]
+            said = found.advice(theirs).removeprefix(f'{topic}: ')
             if not found.looks_like:
                 chosen = option(topic, theirs, SIGNALS[found.signal].unit)
                 said += f' If it is that signal all the same, add {chosen}; if not, name the right'
                 said += f' one with --column {topic}={THEIRS}[:unit]'
-                remedy = choosing(topic, THEIRS)
-            remedy = choosing(topic, THEIRS) if found.other else remedy
-            said = said.removeprefix(f'{topic}: ')
             problems.append(f"'{theirs}' reads like {topic}, but {said}")
-            remedies.append(remedy)
+            remedies.append(found.remedy(theirs))
     if problems:
         raise RefusedError(path, problems, remedies, last=True)
 
@@ -216,12 +208,7 @@ def air_note(signal: Signal, unit: str, theirs: str) -> str:
 
 
 def check_constants(constants: dict[Signal, float], settings: Settings) -> None:
-    """Raise `UsageError` if a constant is outside these limits.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Raise `UsageError` if a constant is outside these limits."""
     for signal, value in constants.items():
         low, high = limits(signal, settings)
         if not low <= value <= high:
@@ -234,33 +221,36 @@ def check_constants(constants: dict[Signal, float], settings: Settings) -> None:
             )
 
 
-def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
-    """Add each constant at every reading of a measured signal.
+def selected(readings: Readings, rows: BoolArray | IntArray) -> Readings:
+    """Return some readings: by a mask, or by their places in any order."""
+    return Readings(
+        readings.time_ns[rows], readings.signal[rows], readings.value[rows],
+        readings.quality[rows],
+    )  # fmt: skip
 
-    Raises
-    ------
-    DataError
-        No signal is measured.
-    """
+
+def joined(parts: Iterable[Readings]) -> Readings:
+    """Return readings one part behind the other."""
+    columns = zip(*((r.time_ns, r.signal, r.value, r.quality) for r in parts), strict=True)
+    return Readings(*map(np.concatenate, columns))
+
+
+def with_constants(readings: Readings, constants: dict[Signal, float]) -> Readings:
+    """Add each constant at every reading of a measured signal; `DataError` if none is measured."""
     if not constants:
         return readings
-    kept = ~np.isin(readings.signal, [int(s) for s in constants])
-    readings = Readings(
-        readings.time_ns[kept], readings.signal[kept], readings.value[kept],
-        readings.quality[kept],
-    )  # fmt: skip
+    readings = selected(readings, ~np.isin(readings.signal, [int(s) for s in constants]))
     measured = [i.signal for i in SIGNALS if i.required and i.signal not in constants]
     lead = next((s for s in measured if (readings.signal == s).any()), None)
     if lead is None:
         raise DataError('Every signal is a constant or missing; nothing is left to learn from.')
     beside = np.flatnonzero(readings.signal == lead)
     for signal, value in sorted(constants.items()):
-        n = len(beside)
         readings = Readings(
             np.insert(readings.time_ns, beside, readings.time_ns[beside]),
-            np.insert(readings.signal, beside, np.full(n, int(signal), dtype=np.int8)),
-            np.insert(readings.value, beside, np.full(n, value)),
-            np.insert(readings.quality, beside, np.full(n, int(Quality.GOOD), dtype=np.uint8)),
+            np.insert(readings.signal, beside, int(signal)),
+            np.insert(readings.value, beside, value),
+            np.insert(readings.quality, beside, int(Quality.GOOD)),
         )
-        beside = beside + np.arange(1, n + 1)
+        beside = beside + np.arange(1, len(beside) + 1)
     return readings

@@ -95,10 +95,7 @@ class InputWatch:
     def health(self, newest_ns: int) -> tuple[HealthView, ...]:
         """Return the health of each signal; an optional signal without readings is left out.
 
-        Parameters
-        ----------
-        newest_ns : int
-            The newest log time of the whole recording.
+        ``newest_ns`` is the newest log time of the whole recording.
         """
         if not newest_ns:
             return ()
@@ -137,16 +134,12 @@ class LogWatch:
     Parameters
     ----------
     path : Path
-        An ``.mcap`` file, an ``.mcap.part``, a recording's folder, or a folder of those.
+        An ``.mcap`` file, an ``.mcap.part``, a recording's folder, or a folder of those; raises
+        `RecordingError` if it is none.
     board : MonitorState, optional
         Object that keeps the state; a new one by default.
     kept : int
         Number of newest predictions that are passed to the board, at the start and later.
-
-    Raises
-    ------
-    RecordingError
-        The path is none of these.
 
     Attributes
     ----------
@@ -169,11 +162,6 @@ class LogWatch:
         self._grown_s = time.monotonic()
         self._heard = False
         self.share = 0.0
-
-    @property
-    def name(self) -> str:
-        """Return the name of the recording."""
-        return self._name
 
     @property
     def finished(self) -> bool:
@@ -234,30 +222,21 @@ class LogWatch:
     def _recorder(self) -> HealthView:
         follower, name = self._follower, self._follower.name
         lost = f' {counted(follower.damaged, "place")} in it damaged.' if follower.damaged else ''
-        level = WARN if follower.damaged else OK
-        size = f'{follower.size / 1e6:.1f} MB'
-        if follower.written:
-            still_s = time.monotonic() - self._grown_s
-            if still_s > _STILL_S:
-                told = f'{name} has not grown for {duration(round(still_s))}.'
-                return HealthView('recorder', WARN, told + lost)
-            return HealthView('recorder', level, f'recording, {name}, {size}.{lost}')
-        if follower.finished:
-            return HealthView('recorder', level, f'finished, {name}, {size}.{lost}')
-        if not name:
+        still_s = time.monotonic() - self._grown_s
+        if follower.written and still_s > _STILL_S:
+            level, told = WARN, f'{name} has not grown for {duration(round(still_s))}.'
+        elif follower.written or follower.finished:
+            doing = 'recording' if follower.written else 'finished'
+            level, told = OK, f'{doing}, {name}, {follower.size / 1e6:.1f} MB.'
+        elif not name:
             return HealthView('recorder', OK, 'no file yet.')
-        told = f'nobody writes {name} any more, and it was not finished.'
-        return HealthView('recorder', WARN, told + lost)
+        else:
+            level, told = WARN, f'nobody writes {name} any more, and it was not finished.'
+        return HealthView('recorder', WARN if lost else level, told + lost)
 
 
 def recording_in(path: Path) -> Path:
-    """Return the recording at a path: itself, or the newest in a folder of recordings.
-
-    Raises
-    ------
-    RecordingError
-        There is none.
-    """
+    """Return the recording at a path: itself, or the newest in a folder of recordings."""
     if not path.exists() and not path.with_name(path.name + '.part').exists():
         raise RecordingError(path, 'is not there')
     if not path.is_dir():

@@ -46,14 +46,8 @@ def fitting(
 ) -> dict[str, float]:
     """Return the parameters that depend on the data and differ from the defaults.
 
-    Parameters
-    ----------
-    steps : mapping
-        Median step of each signal in s.
-    span_s : float
-        Length of the log.
-    given : mapping
-        Parameters set by the user; they override the inferred ones.
+    ``steps`` are the median steps of the signals in s, ``span_s`` is the length of the log;
+    ``given``, set by the user, overrides what is inferred.
     """
     default = {name: row.default for name, row in PARAMETERS.items()}
     period = given.get('sample_period', sample_period(steps))
@@ -94,26 +88,17 @@ def read_parameters(
 ) -> dict[str, Any]:
     """Return the user's parameters: the values of the file, overridden by those of ``--set``.
 
-    ``of_node``: the file must have the form of ROS 2, with the values below a node's name.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read.
-    InputError
-        The file is no parameter file; a name or value in it is wrong.
-    UsageError
-        A name or value of ``--set`` is wrong.
+    ``of_node``: the file must have the form of ROS 2, with the values below a node's name. Raises
+    `RecordingError` or `InputError` for the file, `UsageError` for ``--set``.
     """
     given: dict[str, Any] = {} if file is None else _from_file(file, of_node)
     for text in pairs:
         name, equals, value = text.partition('=')
         if not equals or not name.strip():
             raise UsageError(f"--set '{text}' is not of the form NAME=VALUE.")
+        name = name.strip()
         try:
-            given[name.strip()] = parameter(name.strip()).check(
-                _value(name.strip(), value.strip())
-            )
+            given[name] = parameter(name).check(_value(name, value.strip()))
         except ParameterError as error:
             raise UsageError(str(error)) from None
     return given
@@ -195,49 +180,22 @@ def _flat(content: dict[Any, Any]) -> dict[str, Any]:
 
 
 def settings_for(
-    steps: Mapping[Signal, float],
-    span_s: float,
-    given: Mapping[str, object],
-    *,
-    live: bool = False,
-    held: bool = False,
-) -> tuple[Settings, list[str]]:
+    steps: Mapping[Signal, float], span_s: float, given: Mapping[str, object], *,
+    live: bool = False, held: bool = False,
+) -> tuple[Settings, list[str]]:  # fmt: skip
     """Return the complete settings for a log, and notes on the adapted parameters.
 
     The curve is fitted once, at the end, unless ``live`` requests the behaviour of a live
     monitor. ``held``: values of a compressed log were repeated; a note on this exists already.
-
-    Raises
-    ------
-    ParameterError
-        Values contradict each other.
+    Raises `ParameterError` if values contradict each other.
     """
     adapted = fitting(steps, span_s, given)
     settings = Settings({**adapted, **given, **({} if live else ONE_FIT)})
-    return settings, _words(adapted, given, settings, steps, span_s, held)
-
-
-def _words(
-    adapted: Mapping[str, float],
-    given: Mapping[str, object],
-    settings: Settings,
-    steps: Mapping[Signal, float],
-    span_s: float,
-    held: bool,
-) -> list[str]:
-    said = []
-    period = settings.real('sample_period')
+    period, said = settings.real('sample_period'), []
     told = [
-        f'{name} {adapted[name]:g} {PARAMETERS[name].unit}'
-        for name in (
-            'hold_limit',
-            'lateness',
-            'block',
-            'longest_segment',
-            'alarm_block',
-            'alarm_average',
-        )
-        if name in adapted
+        f'{name} {value:g} {PARAMETERS[name].unit}'
+        for name, value in adapted.items()
+        if name not in ('sample_period', 'window_days')
     ]
     if 'sample_period' in adapted and not held:
         said.append(f'The log has a value every {period:g} s, so the table has that step.')
@@ -254,4 +212,4 @@ def _words(
             f'The log is longer than window_days ({settings.real("window_days"):g} d); '
             'only its last part counts.'
         )
-    return said
+    return settings, said

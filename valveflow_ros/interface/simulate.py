@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +12,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.errors import InputError
-from valveflow_ros.interface import SILENT, Progress
-from valveflow_ros.interface.files import (
-    TABLES,
-    check_log,
-    check_writable,
-    is_empty,
-    whole_file,
-    write_log,
-)
+from valveflow_ros.interface import SILENT, Progress, files
 from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.plant.historian import Historian
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, SimulatedLog, simulate_parts
@@ -132,30 +123,30 @@ class Simulation:
             It cannot be written, or exists already.
         """
         path = Path(path)
-        check_log(path, overwrite=overwrite)
+        files.check_log(path, overwrite=overwrite)
         if truth is not None:
-            check_writable(Path(truth))
+            files.check_writable(Path(truth))
         written = self._write_log(path, overwrite)
         if truth is not None:
-            with whole_file(Path(truth)) as draft:
-                draft.write_text(json.dumps(self.to_json(), indent=2) + '\n', encoding='utf-8')
+            with files.whole_file(Path(truth)) as draft:
+                draft.write_text(files.as_text(self.to_json()), encoding='utf-8')
         return written
 
     def _write_log(self, path: Path, overwrite: bool) -> Path:
         from valveflow_ros.logs import write_table
         from valveflow_ros.logs.mcap.importing import write_readings
 
-        if path.suffix.lower() in TABLES:
-            with whole_file(path) as draft:
+        if path.suffix.lower() in files.TABLES:
+            with files.whole_file(path) as draft:
                 write_table(self.data.table, draft, self._extra())
             return path
         if isinstance(self.data, ThermalLog) and self.data.historian.own_times:
             # A recording in rows would contain values that were never sent.
             return write_readings(
                 [self.data.readings], [info.signal for info in SIGNALS], path,
-                overwrite=overwrite or is_empty(path),
+                overwrite=overwrite or files.is_empty(path),
             ).path  # fmt: skip
-        return write_log(self.data.table, path, overwrite)
+        return files.write_log(self.data.table, path, overwrite)
 
 
 def simulate(
@@ -203,7 +194,14 @@ def simulate(
     if not isinstance(recording, Historian):
         recording = Historian.parse(recording)
     if unit != PAPER:
-        return _thermal(days, seed, effects, unit, recording, start_ns, progress)
+        if not isinstance(unit, ThermalUnit):
+            if unit.partition(':')[0].strip() not in KINDS:
+                known = ', '.join((PAPER, *KINDS))
+                raise InputError(f"There is no unit '{unit}': use one of {known}.")
+            unit = unit_of(unit)
+        data = simulate_thermal(days, seed, unit, recording, start_ns, effects)
+        progress(0.6, 'simulating')
+        return Simulation(data, days, seed)
     if recording != Historian():
         raise InputError(
             "The paper's unit is recorded once a second only. Choose another unit for the "
@@ -216,23 +214,3 @@ def simulate(
         parts.append(part)
         progress(min(0.6, 0.6 * len(parts) / days), 'simulating')
     return Simulation(SimulatedLog.joined(parts), days, seed)
-
-
-def _thermal(
-    days: float,
-    seed: int,
-    effects: Sequence[str | EffectSpec],
-    unit: str | ThermalUnit,
-    recording: Historian,
-    start_ns: int,
-    progress: Progress,
-) -> Simulation:
-    """Simulate a unit that is not the paper's."""
-    if not isinstance(unit, ThermalUnit):
-        if unit.partition(':')[0].strip() not in KINDS:
-            known = ', '.join((PAPER, *KINDS))
-            raise InputError(f"There is no unit '{unit}': use one of {known}.")
-        unit = unit_of(unit)
-    data = simulate_thermal(days, seed, unit, recording, start_ns, effects)
-    progress(0.6, 'simulating')
-    return Simulation(data, days, seed)

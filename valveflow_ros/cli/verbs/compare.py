@@ -8,23 +8,13 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_analysis,
-    add_analysis_options,
-    checked_parameters,
-    columns,
-    lines,
-    log_of,
-    mapping_of,
-    write_results,
-)
+from valveflow_ros.cli import command
 
 if TYPE_CHECKING:
     from valveflow_ros.report.comparison_tables import Compared
 
-_DESCRIPTION = """\
+USAGE = 'LOG -o DIR [options]'
+DESCRIPTION = """\
 Identify the flow characteristic in three ways - from special segments, as a Hammerstein model
 and by sparse identification - and judge all three on data that none of them was fitted to, as
 Section IV of the paper does: parameters, mean squared errors in special segments, paired t
@@ -41,40 +31,39 @@ with a simulated plant, whose true curve is known:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow compare LOG -o DIR [options]'
-    add_analysis(parser, 'the log to learn from')
+    """Add the options."""
+    command.add_analysis(parser, 'the log to learn from')
     parser.add_argument(
         '--test', metavar='LOG2', type=Path, help='a log of other days, for testing only'
     )
-    parser.add_argument(
-        '--truth', metavar='FILE', type=Path,
-        help='the true curve, as "simulate --truth" writes it; a characteristic.json too',
-    )  # fmt: skip
-    add_analysis_options(parser)
+    command.add_file(
+        parser,
+        '--truth',
+        'the true curve, as "simulate --truth" writes it; a characteristic.json too',
+    )
+    command.add_analysis_options(parser)
 
 
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Open the log, identify in three ways, judge, write."""
-    mapping = mapping_of(options)
-    console(0.0, 'starting')
+    log = command.log_of(options, console)
     from valveflow_ros.interface.compare import compare
     from valveflow_ros.interface.logs import open_log
-    from valveflow_ros.interface.models import load_truth
     from valveflow_ros.report.comparison import data_words, finding_words
 
-    given = checked_parameters(options)
-    truth = None if options.truth is None else load_truth(options.truth)
-    log = log_of(options, mapping, console)
-    test = None if options.test is None else open_log(options.test, mapping, progress=console)
-    found = compare(log, test=test, truth=truth, parameters=given, progress=console)
+    def other_days() -> object:
+        return open_log(options.test, command.mapping_of(options), progress=console)
+
+    found = compare(
+        log, test=None if options.test is None else other_days, truth=options.truth,
+        parameters=command.checked_parameters(options), progress=console,
+    )  # fmt: skip
     console(0.95, 'writing the report')
     data = found.data
-    text = lines(data_words(data), *finding_words(data), _parameters(data), _errors(data))
+    text = command.lines(data_words(data), *finding_words(data), _parameters(data), _errors(data))
     # The segments are only written to the file.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
-    return write_results(found, options, text, brief)
+    return command.write_results(found, options, text, brief)
 
 
 def _parameters(data: Compared) -> str:
@@ -96,7 +85,7 @@ def _parameters(data: Compared) -> str:
                 ]
             )
     unit = input_unit_plain(data.result.characteristic.pressure_exponent)
-    return columns(rows, ['curve', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)'])
+    return command.columns(rows, ['curve', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)'])
 
 
 def _errors(data: Compared) -> str:
@@ -116,4 +105,4 @@ def _errors(data: Compared) -> str:
         for name in data.predictions
     ]
     head = ['mean squared error (MW^2)', 'segments', 'steady', 'slope', 'all rows']
-    return columns(rows, head)
+    return command.columns(rows, head)

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.command import Console, VerbResult, columns, lines
+from valveflow_ros.cli.command import Console, VerbResult, add_file, add_output, columns, lines
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.report.terminal.text import number, whole
 
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 _FAR = 0.25  # of the usual pressure
 
-_DESCRIPTION = """\
+USAGE = '--model FILE -o TABLE [options]'
+DESCRIPTION = """\
 Write the inverse of a flow characteristic as a table: the input u of the curve that gives a
 demanded power, and for each --pressure the opening. Used in the controller before the valve,
 it makes the response of the unit equal at every load. The breakpoints of the curve are rows of
@@ -43,16 +44,9 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow compensate --model FILE -o TABLE [options]'
-    parser.add_argument(
-        '--model', metavar='FILE', type=Path, required=True,
-        help='a characteristic.json, as identify writes it',
-    )  # fmt: skip
-    parser.add_argument(
-        '-o', '--output', metavar='TABLE', type=Path, required=True, help='a .csv or .parquet file'
-    )
+    """Add the options."""
+    add_file(parser, '--model', 'a characteristic.json, as identify writes it', required=True)
+    add_output(parser, 'TABLE', 'a .csv or .parquet file')
     parser.add_argument(
         '--points', metavar='N', default=16,
         type=whole('a number of points', 2, 10_000, '--points 16'),
@@ -75,9 +69,12 @@ def arguments(parser: ArgumentParser) -> None:
         help='largest error allowed of F(F^-1(x)) and of the table; beyond it nothing is written '
         '(default: 0.01)',
     )  # fmt: skip
-    for way, which, example in (('from', 'smaller', 1100), ('to', 'larger', 2200)):
+    for way, which, example, end in (
+        ('from', 'smaller', 1100, -math.inf), ('to', 'larger', 2200, math.inf),
+    ):  # fmt: skip
         parser.add_argument(
-            f'--u-{way}', metavar='U', help=f'leave {which} values of u out of the table',
+            f'--u-{way}', metavar='U', default=end,
+            help=f'leave {which} values of u out of the table',
             type=number('a number, a value of u', -math.inf, math.inf, f'--u-{way} {example}'),
         )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace a table that is there')
@@ -106,11 +103,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         shown = [(curve.at_pressure(p), [p]) for p in at]
 
     def make(cut: Characteristic, points: int) -> Compensation:
-        return compensate(
-            cut, points, options.max_gain,
-            -math.inf if options.u_from is None else options.u_from,
-            math.inf if options.u_to is None else options.u_to,
-        )  # fmt: skip
+        return compensate(cut, points, options.max_gain, options.u_from, options.u_to)
 
     tables, texts, data = [], [], []
     for sentence in (*curve.notes, *_far(curve, [p for _, at in shown for p in at])):
@@ -124,12 +117,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         texts.append(_text(made, shown_at, options.tolerance, options.output))
         data.append(_data(made, tables[-1], shown_at, options.tolerance, options.output))
     _write(tables[0] if len(shown) == 1 else _stacked(tables, pressures), options.output)
-    form = {
-        'axis': curve.axis,
-        'pressure_exponent': curve.pressure_exponent,
-        'pressure_scale_exponent': curve.pressure_scale_exponent,
-        'offset_mw': curve.offset_mw,
-    }
+    names = ('axis', 'pressure_exponent', 'pressure_scale_exponent', 'offset_mw')
+    form = {name: getattr(curve, name) for name in names}
     if len(shown) == 1:
         return VerbResult(texts[0], {**form, **data[0]})
     text = '\n'.join(f'At {p:g} MPa:\n{one}' for p, one in zip(pressures, texts, strict=True))
@@ -145,7 +134,7 @@ def _unseen(
 
     told = []
     for p in pressures:
-        marks = table.get(_seen_column(p))
+        marks = table.get(f'seen_at_{p:g}_mpa')
         if marks is None or marks.all():
             continue
         seen, rows = seen_at(curve, p), counted(int((marks == 0.0).sum()), 'row')
@@ -167,10 +156,6 @@ def _stacked(
     stacked = {'pressure_mpa': np.repeat(np.array(pressures), rows)}
     names = [{name.partition('_at_')[0]: column for name, column in t.items()} for t in tables]
     return stacked | {name: np.concatenate([t[name] for t in names]) for name in names[0]}
-
-
-def _seen_column(pressure: float) -> str:
-    return f'seen_at_{pressure:g}_mpa'
 
 
 def _far(curve: Characteristic, pressures: Sequence[float]) -> list[str]:
@@ -225,7 +210,6 @@ def _table(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArr
 
     from valveflow_ros.curve.compensation import seen_at
 
-    exponent = made.curve.pressure_exponent
     table = {
         'power_mw': made.power_mw,
         'u': made.u,
@@ -234,36 +218,33 @@ def _table(made: Compensation, pressures: Sequence[float]) -> dict[str, FloatArr
         'within_gain_limit': made.within.astype(np.float64),
     }
     for p in pressures:
-        opening = np.round(made.u / p**exponent, 6)
+        opening = np.round(made.u / p**made.curve.pressure_exponent, 6)
         table[f'opening_percent_at_{p:g}_mpa'] = opening
         if made.curve.openings_seen:
             low, high = seen_at(made.curve, p) or (math.inf, -math.inf)
-            table[_seen_column(p)] = ((opening >= low) & (opening <= high)).astype(np.float64)
+            table[f'seen_at_{p:g}_mpa'] = ((opening >= low) & (opening <= high)).astype(np.float64)
     return table
 
 
 def _write(table: Mapping[str, FloatArray], path: Path) -> None:
     """Write CSV or Parquet; values that are not finite are empty cells."""
-    from valveflow_ros.interface.files import whole_file
+    import numpy as np
 
-    def cell(value: float) -> float | None:
-        return float(value) if math.isfinite(value) else None
+    from valveflow_ros.interface.files import whole_file
 
     with whole_file(path) as draft:
         if path.suffix.lower() == '.parquet':
             import pyarrow as pa
             import pyarrow.parquet as pq
 
-            cells = {name: [cell(v) for v in column] for name, column in table.items()}
-            pq.write_table(
-                pa.table({n: pa.array(c, pa.float64()) for n, c in cells.items()}), draft
-            )
+            cells = {n: pa.array(c, mask=~np.isfinite(c)) for n, c in table.items()}
+            pq.write_table(pa.table(cells), draft)
             return
         with draft.open('w', encoding='utf-8', newline='') as file:
             writer = csv.writer(file)
             writer.writerow(table)
             for row in zip(*table.values(), strict=True):
-                writer.writerow(['' if cell(v) is None else f'{v:.10g}' for v in row])
+                writer.writerow([f'{v:.10g}' if math.isfinite(v) else '' for v in row])
 
 
 def _text(made: Compensation, pressures: Sequence[float], tolerance: float, path: Path) -> str:
@@ -295,20 +276,21 @@ def _pieces(made: Compensation, pressures: Sequence[float]) -> str:
     """Return one line per piece."""
     from valveflow_ros.report.words import decimals, plain
 
+    def span(low: float, high: float, places: int = 1) -> str:
+        return f'{decimals(low, places)} to {decimals(high, places)}'
+
     rows = []
+    factors = [p**made.curve.pressure_exponent for p in pressures]
     pairs = zip(made.curve.pieces, made.gains, strict=True)
     for k, (piece, gain) in enumerate(pairs, made.first_piece):
-        low, high = (piece.slope * end + piece.intercept for end in (piece.u_from, piece.u_to))
-        row = [
-            str(k), f'{decimals(low, 1)} to {decimals(high, 1)}',
-            f'{decimals(piece.u_from, 1)} to {decimals(piece.u_to, 1)}', plain(float(gain), 3),
-        ]  # fmt: skip
-        for p in pressures:
-            factor = p**made.curve.pressure_exponent
-            row.append(
-                f'{decimals(piece.u_from / factor, 2)} to {decimals(piece.u_to / factor, 2)}'
-            )
-        rows.append([*row, 'yes' if gain <= made.gain_limit else 'no'])
+        low, high = piece.u_from, piece.u_to
+        rows.append([
+            str(k),
+            span(piece.slope * low + piece.intercept, piece.slope * high + piece.intercept),
+            span(low, high), plain(float(gain), 3),
+            *(span(low / f, high / f, 2) for f in factors),
+            'yes' if gain <= made.gain_limit else 'no',
+        ])  # fmt: skip
     head = ['piece', 'power (MW)', 'u', 'u per MW']
     head += [f'opening at {p:g} MPa (%)' for p in pressures]
     return columns(rows, [*head, 'of use'])

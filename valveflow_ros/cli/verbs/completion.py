@@ -13,7 +13,8 @@ from valveflow_ros.cli.command import Console, VerbResult
 
 SHELLS = ('bash', 'zsh', 'fish')
 
-_DESCRIPTION = """\
+USAGE = 'SHELL'
+DESCRIPTION = """\
 Print a script that teaches the shell to finish verbs, options, effects, signals and parameters
 when Tab is pressed. One line in the file that the shell reads at its start is enough.
 
@@ -26,9 +27,7 @@ in ~/.config/fish/config.fish:  valveflow completion fish | source"""
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow completion SHELL'
+    """Add the options."""
     parser.add_argument('shell', metavar='SHELL', choices=SHELLS, help='bash, zsh or fish')
 
 
@@ -43,12 +42,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 def complete(verbs: list[tuple[str, str]], parser_of: Callable[[str], ArgumentParser]) -> None:
     """Answer a completion request of the shell for the words typed so far, and exit.
 
-    Parameters
-    ----------
-    verbs : list of (str, str)
-        Names and descriptions.
-    parser_of : callable
-        Returns the parser of a verb.
+    ``verbs`` are names and descriptions; ``parser_of`` returns the parser of a verb.
     """
     import argcomplete
 

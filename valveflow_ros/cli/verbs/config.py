@@ -7,10 +7,18 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import Console, VerbResult, add_mapping, mapping_of
+from valveflow_ros.cli.command import (
+    Console,
+    VerbResult,
+    add_mapping,
+    add_output,
+    lines,
+    mapping_of,
+)
 from valveflow_ros.errors import InputError, ParameterError, UsageError, counted
 
-_DESCRIPTION = """\
+USAGE = 'init LOG [-o FILE] [options]\n       valveflow config check FILE'
+DESCRIPTION = """\
 init LOG reads a log of the plant and writes a parameter file for the monitor: every parameter
 with its meaning, unit and range; those that the data show (the step, the units, the noise, time
 constants) are set from the data, with the reason; the others have their default. check FILE
@@ -23,17 +31,11 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = (
-        'valveflow config init LOG [-o FILE] [options]\n       valveflow config check FILE'
-    )
+    """Add the options."""
     parser.add_argument('task', metavar='init|check', help='make a parameter file, or check one')
     parser.add_argument('place', metavar='LOG|FILE', type=Path, help='the log, or the file')
-    parser.add_argument(
-        '-o', '--output', metavar='FILE', type=Path,
-        help='where to write the parameters (default: on the screen)',
-    )  # fmt: skip
+    told = 'where to write the parameters (default: on the screen)'
+    add_output(parser, 'FILE', told, required=False)
     parser.add_argument('--unit-tag', metavar='TAG', help='tag of the unit, such as U3')
     parser.add_argument('--overwrite', action='store_true', help='replace a file that is there')
     add_mapping(parser)
@@ -67,9 +69,9 @@ def run(options: Namespace, console: Console) -> VerbResult:
         return VerbResult(text, data)
     with whole_file(options.output) as draft:
         draft.write_text(text, encoding='utf-8')
-    lines = [f'  {f.name}: {f.shown}  ({f.ground})' for f in found.values()]
-    said = ['Fitted to the data:', *lines] if lines else ['Nothing differs from the defaults.']
-    return VerbResult('\n'.join([*said, *found.left, f'Wrote {options.output}.']), data)
+    said = [f'  {f.name}: {f.shown}  ({f.ground})' for f in found.values()]
+    head = 'Fitted to the data:' if said else 'Nothing differs from the defaults.'
+    return VerbResult(lines(head, *said, *found.left, f'Wrote {options.output}.'), data)
 
 
 def _checked(file: Path) -> VerbResult:
@@ -91,14 +93,21 @@ def _checked(file: Path) -> VerbResult:
         '1 differs from its default' if len(changed) == 1 else
         f'{len(changed)} differ from their defaults'
     )  # fmt: skip
-    lines = [f'{file}: the monitor takes it; {counted(len(given), "parameter")}, {many}.']
-    for name, value in changed.items():
-        unit, default = PARAMETERS[name].unit, PARAMETERS[name].default
-        lines.append(f'  {name}: {_shown(value, unit)}, default {_shown(default, unit)}')
-    return VerbResult('\n'.join(lines), {'file': str(file), 'good': True, 'changed': changed})
+    rows = (PARAMETERS[name] for name in changed)
+    text = lines(
+        f'{file}: the monitor takes it; {counted(len(given), "parameter")}, {many}.',
+        *(
+            f'  {row.name}: {_shown(changed[row.name], row.unit)}, '
+            f'default {_shown(row.default, row.unit)}'
+            for row in rows
+        ),
+    )
+    return VerbResult(text, {'file': str(file), 'good': True, 'changed': changed})
 
 
 def _shown(value: object, unit: str) -> str:
-    text = f'{value:g}' if isinstance(value, float) else f"'{value}'" if isinstance(
-        value, str) else str(value).lower()  # fmt: skip
-    return f'{text} {unit}' if unit else text
+    if isinstance(value, float):
+        text = f'{value:g}'
+    else:
+        text = f"'{value}'" if isinstance(value, str) else str(value).lower()
+    return f'{text} {unit}'.rstrip()

@@ -5,28 +5,15 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_analysis,
-    add_analysis_options,
-    add_covariate,
-    checked_parameters,
-    columns,
-    covariates_of,
-    lines,
-    log_of,
-    mapping_of,
-    write_results,
-)
+from valveflow_ros.cli import command
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.diagnose import DiagnosisResult
 
-_DESCRIPTION = """\
+USAGE = 'LOG -o DIR [options]'
+DESCRIPTION = """\
 Compare the simulation (flow characteristic and regional dynamics, run on the measured opening
 and pressure) with the measured power, name the physical cause of what differs, extend the model
 by it, and measure on blocks of time that were not used for fitting how much the error falls. DIR
@@ -43,39 +30,31 @@ with the condenser pressure, which the power follows too:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow diagnose LOG -o DIR [options]'
-    add_analysis(parser)
-    parser.add_argument(
-        '--model', metavar='FILE', type=Path,
-        help='characteristic.json or extended_model.json of an earlier log, to compare with '
+    """Add the options."""
+    command.add_analysis(parser)
+    command.add_file(
+        parser,
+        '--model',
+        'characteristic.json or extended_model.json of an earlier log, to compare with '
         'this one; without it the curve is found from this log',
-    )  # fmt: skip
-    add_covariate(parser)
-    add_analysis_options(parser)
-
-
-def run(options: Namespace, console: Console) -> VerbResult:
-    """Open the log, diagnose, write."""
-    mapping = mapping_of(options)
-    covariates = covariates_of(options)
-    console(0.0, 'starting')
-    from valveflow_ros.diagnosis.result import to_json
-    from valveflow_ros.interface.diagnose import diagnose, load_diagnosable
-    from valveflow_ros.interface.models import with_exponent
-
-    given = checked_parameters(options)
-    model = None
-    if options.model is not None:
-        model = load_diagnosable(options.model)
-        given = with_exponent(model, given, options.model)
-    log = log_of(options, mapping, console)
-    found = diagnose(
-        log, parameters=given, model=model, covariates=covariates or None, progress=console
     )
+    command.add_covariate(parser)
+    command.add_analysis_options(parser)
+
+
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
+    """Open the log, diagnose, write."""
+    covariates = command.covariates_of(options)
+    log = command.log_of(options, console)
+    from valveflow_ros.diagnosis.result import to_json
+    from valveflow_ros.interface.diagnose import diagnose
+
+    found = diagnose(
+        log, parameters=command.checked_parameters(options), model=options.model,
+        covariates=covariates or None, progress=console,
+    )  # fmt: skip
     console(0.95, 'writing the report')
-    return write_results(found, options, _text(found), to_json(found.diagnosis))
+    return command.write_results(found, options, _text(found), to_json(found.diagnosis))
 
 
 def _text(found: DiagnosisResult) -> str:
@@ -94,10 +73,10 @@ def _text(found: DiagnosisResult) -> str:
         if why.startswith(blind):
             unjudged.setdefault(why.removeprefix(blind).lstrip(': '), []).append(name)
     judged = [f'  {", ".join(names)}: {why}' for why, names in unjudged.items()]
-    return lines(
+    return command.lines(
         f'{found.data.source}: {VERDICT_WORDS[d.verdict]}. {d.sentence}',
         *(advice(c.name, c.meaning, c.to_do) for c in d.causes),
-        columns(rows, ['cause', 'parameter', 'value', '95 % interval']) if rows else '',
+        command.table(rows, ['cause', 'parameter', 'value', '95 % interval']),
         *(f'What would tell them apart: {e}' for e in d.experiments),
         'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
         f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW, '

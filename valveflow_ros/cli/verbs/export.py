@@ -7,9 +7,18 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import Console, VerbResult, add_mapping, mapping_of, rejected_words
+from valveflow_ros.cli.command import (
+    Console,
+    VerbResult,
+    add_mapping,
+    add_output,
+    add_set,
+    mapping_of,
+    rejected_words,
+)
 
-_DESCRIPTION = """\
+USAGE = 'LOG -o TABLE [options]'
+DESCRIPTION = """\
 Write a log as a table with one row for each time: the rows that are used for fitting, in their
 units. Where a signal has no usable value the cell is empty.
 
@@ -23,23 +32,16 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow export LOG -o TABLE [options]'
+    """Add the options."""
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to read')
-    parser.add_argument(
-        '-o', '--output', metavar='TABLE', type=Path, required=True, help='a .csv or .parquet file'
-    )
+    add_output(parser, 'TABLE', 'a .csv or .parquet file')
     parser.add_argument(
         '--outputs', action='store_true',
         help='what the monitor published: TABLE names the tables, which get a kind behind '
         'their name',
     )  # fmt: skip
     add_mapping(parser)
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='a parameter, such as sample_period=10',
-    )  # fmt: skip
+    add_set(parser, 'a parameter, such as sample_period=10')
     parser.add_argument('--overwrite', action='store_true', help='replace a table that is there')
 
 

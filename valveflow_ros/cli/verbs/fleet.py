@@ -7,16 +7,10 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import (
-    Console,
-    TableOption,
-    VerbResult,
-    add_mapping,
-    columns,
-    lines,
-)
+from valveflow_ros.cli import command
 
-_DESCRIPTION = """\
+USAGE = 'LOGS... -o DIR [options]'
+DESCRIPTION = """\
 Identify, diagnose and monitor many logs of many units, side by side on the cores of this machine
 or on a Dask cluster. The curve of a log is the reference of the next one of its unit. DIR gets
 fleet.html (which units lose power, since when and why), fleet.parquet (one row for each log) and
@@ -34,16 +28,11 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow fleet LOGS... -o DIR [options]'
+    """Add the options."""
     parser.add_argument(
         'logs', metavar='LOGS', nargs='+', type=Path, help='logs, folders, globs or manifests'
     )
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for the results, made if absent',
-    )  # fmt: skip
+    command.add_output(parser, 'DIR', 'folder for the results, made if absent')
     parser.add_argument(
         '--scheduler', metavar='ADDRESS', default='',
         help='a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers see LOGS and DIR under '
@@ -53,24 +42,11 @@ def arguments(parser: ArgumentParser) -> None:
         '--no-diagnosis', action='store_true',
         help="leave out the monitor's own diagnoses; each log is diagnosed once all the same",
     )  # fmt: skip
-    parser.add_argument(
-        '--params',
-        metavar='FILE',
-        type=Path,
-        help='parameters: a YAML file as the node takes it, or with one NAME: VALUE in a line',
-    )
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='NAME=VALUE', dest='pairs',
-        help='one parameter, such as time_constant=120; overrides the file',
-    )  # fmt: skip
-    add_mapping(parser)
+    command.add_parameters(parser)
+    command.add_mapping(parser)
 
 
-_NONE = 'No unit is seen to have changed.'
-_NOT_JUDGED = 'No unit can be judged yet: a change needs two logs with a curve.'
-
-
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Read the list of tasks, run them, report the outcome."""
     console(0.0, 'starting')
     from valveflow_ros.interface.fleets.fleet import fleet
@@ -80,8 +56,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
     for name, said in (('set', options.pairs), ('constant', options.constant)):
         words += [f'--{name}={value}' for value in said]
     for given in options.column:
-        named = given if isinstance(given, TableOption) else TableOption('column', given)
-        words.append(f'--{named.option}={named.value}')
+        option, value = ('column', given) if isinstance(given, str) else given
+        words.append(f'--{option}={value}')
     words += ['--no-diagnosis'] if options.no_diagnosis else []
     found = fleet(
         options.logs, options.output, scheduler=options.scheduler, options=words,
@@ -93,14 +69,18 @@ def run(options: Namespace, console: Console) -> VerbResult:
          ', '.join(s.causes) or 'not named']
         for s in moved
     ]  # fmt: skip
-    judged = any(s.change_mw is not None for s in found.stories)
+    none = (
+        'No unit is seen to have changed.'
+        if any(s.change_mw is not None for s in found.stories)
+        else 'No unit can be judged yet: a change needs two logs with a curve.'
+    )
+    head = ['unit that changed', 'mean', 'since', 'named (perhaps only a part)']
     content = found.to_json()
-    text = lines(
+    text = command.lines(
         f'{counted(len(found.stories), "unit")}: {counted(found.anew, "log")} done now, '
         f'{found.unchanged} unchanged, {found.failed} without a result.',
-        columns(rows, ['unit that changed', 'mean', 'since', 'named (perhaps only a part)'])
-        if rows else _NONE if judged else _NOT_JUDGED,
+        command.table(rows, head) or none,
         *(f'{s.unit} {log}: {why}' for s in found.stories for log, why in s.failures[:3]),
         f'Wrote {" and ".join(content["files"].values())}.',
     )  # fmt: skip
-    return VerbResult(text, content)
+    return command.VerbResult(text, content)

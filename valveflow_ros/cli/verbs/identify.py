@@ -5,30 +5,17 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_analysis,
-    add_analysis_options,
-    checked_parameters,
-    columns,
-    lines,
-    log_of,
-    mapping_of,
-    rejected_words,
-    write_results,
-)
-from valveflow_ros.errors import UsageError
+from valveflow_ros.cli import command
 
 if TYPE_CHECKING:
     from valveflow_ros.curve.characteristic import Characteristic
     from valveflow_ros.interface.identify import Identification
     from valveflow_ros.report.identified import Identified
 
-_DESCRIPTION = """\
+USAGE = 'LOG -o DIR [options]'
+DESCRIPTION = """\
 Find the flow characteristic of the valve in a log of ordinary operation: steady states and
 steady ramps are selected, and a curve of straight pieces is fitted to them. DIR gets
 report.html for people and characteristic.json for programs. The sampling interval is found
@@ -47,54 +34,39 @@ without the effect of causes that diagnose found in an earlier log:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow identify LOG -o DIR [options]'
-    add_analysis(parser)
-    parser.add_argument(
-        '--model', metavar='FILE', type=Path,
-        help='an extended_model.json of diagnose: its causes are kept fixed, curve and dynamics '
+    """Add the options."""
+    command.add_analysis(parser)
+    command.add_file(
+        parser,
+        '--model',
+        'an extended_model.json of diagnose: its causes are kept fixed, curve and dynamics '
         'are found anew',
-    )  # fmt: skip
-    parser.add_argument(
-        '--reference', metavar='FILE', type=Path,
-        help='a characteristic.json to judge the curve against: DIR gets shift.json',
-    )  # fmt: skip
+    )
+    command.add_file(
+        parser,
+        '--reference',
+        'a characteristic.json to judge the curve against: DIR gets shift.json',
+    )
     parser.add_argument(
         '--step-test', action='store_true',
         help='the log is a manual test: pressure constant, the opening in steps, each held',
     )  # fmt: skip
-    add_analysis_options(parser)
+    command.add_analysis_options(parser)
 
 
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Open the log, identify, write."""
-    mapping = mapping_of(options)
-    console(0.0, 'starting')
+    log = command.log_of(options, console)
     from valveflow_ros.interface.identify import identify
-    from valveflow_ros.interface.models import (
-        load_characteristic,
-        load_extended,
-        with_exponent,
-    )
 
-    given = checked_parameters(options)
-    reference = load_characteristic(options.reference) if options.reference else None
-    model = None
+    given = command.checked_parameters(options)
     # A parameter file of the node may contain a model too.
-    if named := options.model or given.get('model_file'):
-        path = Path(str(named)).expanduser()
-        if options.step_test:
-            raise UsageError('--step-test and --model do not go together.')
-        model = load_extended(path)
-        given = with_exponent(model, given, path)
-    log = log_of(options, mapping, console)
     found = identify(
-        log, parameters=given, model=model, reference=reference, step_test=options.step_test,
-        progress=console,
+        log, parameters=given, model=options.model or given.get('model_file') or None,
+        reference=options.reference, step_test=options.step_test, progress=console,
     )  # fmt: skip
     console(0.9, 'writing the report')
-    return write_results(found, options, _text(found.data), _data(found))
+    return command.write_results(found, options, _text(found.data), _data(found))
 
 
 def _data(found: Identification) -> dict[str, Any]:
@@ -117,24 +89,18 @@ def _data(found: Identification) -> dict[str, Any]:
 
 
 def _text(found: Identified) -> str:
-    from valveflow_ros.report.answer import (
-        doubt,
-        explained,
-        form_words,
-        pieces_doubt,
-        temperature_words,
-    )
+    from valveflow_ros.report import answer
     from valveflow_ros.report.data import rejected
     from valveflow_ros.report.words import counted, held_words, moment, percent, plain
 
     c = found.characteristic
-    return lines(
+    return command.lines(
         f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
         f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
-        f'{percent(explained(found))} of the variance of the power.',
-        doubt(found),
-        pieces_doubt(c),
-        form_words(c),
+        f'{percent(answer.explained(found))} of the variance of the power.',
+        answer.doubt(found),
+        answer.pieces_doubt(c),
+        answer.form_words(c),
         _by_load(found),
         _pieces(found),
         _breakpoints(found.shown),
@@ -144,11 +110,11 @@ def _text(found: Identified) -> str:
         f'{counted(c.source.slope_response, "slope-response segment")}, '
         f'{counted(c.source.samples, "sample")}. Typical difference '
         f'{plain(c.residuals.rmse_mw, 2)} MW.',
-        temperature_words(c),
+        answer.temperature_words(c),
         held_words(c.held),
         *c.notes,
         '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
-        rejected_words(found.counts) if rejected(found.counts) else '',
+        command.rejected_words(found.counts) if rejected(found.counts) else '',
     )
 
 
@@ -156,36 +122,28 @@ def _by_load(found: Identified) -> str:
     from valveflow_ros.report.answer import gain_cells
 
     head, cells = gain_cells(found)
-    return columns(cells, head) if cells else ''
+    return command.table(cells, head)
 
 
 def _pieces(found: Identified) -> str:
-    from valveflow_ros.report.words import (
-        count,
-        input_name,
-        input_unit_plain,
-        per_input,
-        span,
-        with_error,
-    )
+    from valveflow_ros.report import words
 
     c = found.shown
-    rows = []
-    for k, piece in enumerate(c.pieces):
-        rows.append(
-            [
-                str(k + 1),
-                span(piece.u_from, piece.u_to, 1),
-                with_error(piece.slope, piece.slope_stderr),
-                with_error(piece.intercept, piece.intercept_stderr),
-                count(piece.samples),
-            ]
-        )
+    rows = [
+        [
+            str(k),
+            words.span(piece.u_from, piece.u_to, 1),
+            words.with_error(piece.slope, piece.slope_stderr),
+            words.with_error(piece.intercept, piece.intercept_stderr),
+            words.count(piece.samples),
+        ]
+        for k, piece in enumerate(c.pieces, 1)
+    ]
     m = c.pressure_exponent
-    head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})',
-            f'slope{found.at_pressure} ({per_input(m)})', 'intercept (MW)',
+    head = ['piece', f'{words.input_name(m)} ({words.input_unit_plain(m)})',
+            f'slope{found.at_pressure} ({words.per_input(m)})', 'intercept (MW)',
             'samples']  # fmt: skip
-    return columns(rows, head)
+    return command.columns(rows, head)
 
 
 def _breakpoints(c: Characteristic) -> str:
@@ -198,7 +156,7 @@ def _breakpoints(c: Characteristic) -> str:
         )
     ]
     head = [f'breakpoint {input_name(c.pressure_exponent)}', '95 % interval', 'power']
-    return columns(rows, head) if rows else ''
+    return command.table(rows, head)
 
 
 def _dynamics(c: Characteristic) -> str:
@@ -212,4 +170,4 @@ def _dynamics(c: Characteristic) -> str:
         ]
         for d in c.dynamics
     ]
-    return columns(rows, ['dynamics', 'time constant', 'delay']) if rows else ''
+    return command.table(rows, ['dynamics', 'time constant', 'delay'])

@@ -11,17 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import (
-    Console,
-    TableOption,
-    VerbResult,
-    add_covariate,
-    add_mapping,
-    columns,
-    covariates_of,
-    mapping_of,
-    time_ns,
-)
+from valveflow_ros.cli import command
+from valveflow_ros.cli.command import Console, TableOption, VerbResult, time_ns
 from valveflow_ros.errors import DataError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -29,7 +20,8 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.mapping import LogMapping
     from valveflow_ros.logs.tables.refusal import RefusedError, Remedy
 
-_DESCRIPTION = """\
+USAGE = 'TABLE -o LOG.mcap [options]'
+DESCRIPTION = """\
 Read a table exported from a historian (CSV, Excel or Parquet; one column for each signal, or one
 row for each value) and write it as an MCAP recording that valveflow, ros2 bag, Foxglove and
 PlotJuggler read. It recognises columns, units, dates and decimal marks, and shows what it
@@ -59,22 +51,18 @@ _CHOICES = ('time-zone', 'date-order', 'decimal', 'sheet')
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow import TABLE -o LOG.mcap [options]'
+    """Add the options."""
     parser.add_argument(
         'table', metavar='TABLE', type=_source,
         help='a .csv, .xlsx or .parquet file, or opcua://host:port',
     )  # fmt: skip
-    parser.add_argument(
-        '-o', '--output', metavar='LOG', type=Path,
-        help='where to write: an .mcap file, or a folder as ros2 bag makes it',
-    )  # fmt: skip
+    told = 'where to write: an .mcap file, or a folder as ros2 bag makes it'
+    command.add_output(parser, 'LOG', told, required=False)
     parser.add_argument(
         '--dry-run', action='store_true', help='show what was recognised and write nothing'
     )
-    add_mapping(parser)
-    add_covariate(
+    command.add_mapping(parser)
+    command.add_covariate(
         parser, 'a further column to keep as the topic NAME, for diagnose and monitor --covariate'
     )
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')
@@ -84,22 +72,18 @@ def arguments(parser: ArgumentParser) -> None:
         help='OPC UA nodes of the signals and login of the server; see docs/tutorial_opcua.md',
     )  # fmt: skip
     historian.add_argument('--unit', metavar='TAG', help='which unit of several in that file')
-    historian.add_argument(
-        '--from',
-        dest='begin',
-        metavar='TIME',
-        help='begin of the period, such as 2026-01-31 or 2026-01-31T06:00Z',
-    )
-    historian.add_argument(
-        '--to', dest='end', metavar='TIME', help='end of the period; not included'
-    )
+    for option, name, told in (
+        ('--from', 'begin', 'begin of the period, such as 2026-01-31 or 2026-01-31T06:00Z'),
+        ('--to', 'end', 'end of the period; not included'),
+    ):
+        historian.add_argument(option, dest=name, metavar='TIME', help=told)
 
 
 def run(options: Namespace, console: Console) -> VerbResult:
     """Read, convert, write, and report how the table was interpreted."""
     if isinstance(options.table, str):
         return _from_history(options, console)
-    mapping = mapping_of(options)
+    mapping = command.mapping_of(options)
     if options.output is None and not options.dry_run:
         raise UsageError(
             'Name the log to write with -o LOG.mcap, or add --dry-run to write nothing.'
@@ -136,8 +120,7 @@ def _source(text: str) -> Path | str:
 
 
 def _from_history(options: Namespace, console: Console) -> VerbResult:
-    wanted = (options.mapping, options.begin, options.end, options.output)
-    if None in wanted:
+    if None in (options.mapping, options.begin, options.end, options.output):
         raise UsageError(
             'The history of a server wants --mapping FILE, --from TIME, --to TIME and -o LOG.'
         )
@@ -174,7 +157,7 @@ def _further(options: Namespace) -> dict[str, str]:
     from valveflow_ros.diagnosis.causes import check_covariates
     from valveflow_ros.records import SIGNALS
 
-    covariates = covariates_of(options)
+    covariates = command.covariates_of(options)
     check_covariates(covariates)
     for name in covariates.keys() & {info.topic for info in SIGNALS}:
         raise InputError(f"--covariate '{name}' is the name of a signal; choose another name.")
@@ -264,7 +247,7 @@ def _understood(table: TableImport) -> list[str]:
     lines = [
         f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
         f'Times: {table.time_words}; zone: {zone}.',
-        columns(rows, _HEAD),
+        command.columns(rows, _HEAD),
     ]
     lines += [source.air for source in sources if source.air]
     for source in sources:
@@ -332,9 +315,7 @@ def _command(refused: RefusedError, options: Namespace) -> str:
     from valveflow_ros.logs.tables.refusal import Remedy, quoted
 
     given = [
-        Remedy(said.option, said.value)
-        if isinstance(said, TableOption)
-        else Remedy('column', said)
+        Remedy(*(said if isinstance(said, TableOption) else ('column', said)))
         for said in options.column
     ]
     given += [Remedy('constant', said) for said in options.constant]

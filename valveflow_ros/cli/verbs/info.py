@@ -8,15 +8,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_mapping,
-    columns,
-    lines,
-    mapping_of,
-    rejected_words,
-)
+from valveflow_ros.cli import command
 from valveflow_ros.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -28,7 +20,8 @@ _LARGE_BYTES = 20_000_000  # smaller files are read without noticeable delay
 _GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 
 _OTHER_NS = 60 * 10**9  # beyond it, times of messages and of their values differ
-_DESCRIPTION = """\
+USAGE = 'LOG [options]'
+DESCRIPTION = """\
 Show what a log contains before working with it: its time span, topics and rates, the range of
 each signal, gaps, values that will be rejected and why, attachments, and whether anything is
 damaged.
@@ -38,21 +31,20 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow info LOG [options]'
+    """Add the options."""
     parser.add_argument('log', metavar='LOG', type=Path, help='the log to show')
-    add_mapping(parser)
+    command.add_mapping(parser)
 
 
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Read the log and describe it."""
-    mapping = mapping_of(options)
+    mapping = command.mapping_of(options)
     console(0.1, 'reading')
     if not options.json and (told := _summary(options.log)):
         console.say(told)
     from valveflow_ros.interface.logs import open_log, steps_of
     from valveflow_ros.interface.settings import settings_for
+    from valveflow_ros.records import SIGNALS
 
     log = open_log(options.log, mapping, progress=console)
     parts = log.recorded.by_signal()
@@ -71,10 +63,9 @@ def run(options: Namespace, console: Console) -> VerbResult:
     data_ns = (int(times.min()), int(times.max())) if len(times) else (None, None)
     seconds = 0.0 if start is None or end is None else (end - start) / 1e9
     signals = {
-        info['topic']: info
+        SIGNALS[s].topic: _facts(log, s, parts[s], steps.get(s, float('nan')), stands_s)
         for s in sorted({*contents.signals, *log.constants})
         if s in parts
-        for info in [_facts(log, s, parts[s], steps.get(s, float('nan')), stands_s)]
     }
     data = {
         'log': contents.path,
@@ -94,7 +85,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         ],
         'signals': {
             topic: {
-                **{k: v for k, v in facts.items() if k not in ('topic', 'gaps')},
+                **facts,
                 'gaps': len(facts['gaps']),
                 'longest_gap_s': facts['gaps'][0].seconds if facts['gaps'] else 0.0,
             }
@@ -106,7 +97,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
         'damaged_chunks': contents.damaged_chunks,
         'warnings': list(log.notes),
     }
-    return VerbResult(_text(data, signals), data)
+    return command.VerbResult(_text(data, signals), data)
 
 
 def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
@@ -121,7 +112,7 @@ def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
     ends = ((data[f'data_{end}'], data[end]) for end in ('start_ns', 'end_ns'))
     if any(None not in pair and abs(pair[0] - pair[1]) > _OTHER_NS for pair in ends):
         first, last = data['data_start_ns'], data['data_end_ns']
-        span = lines(
+        span = command.lines(
             f'  data: {moment(first)} to {moment(last)} ({duration((last - first) / 1e9)})',
             f'  recorded: {span.strip()}' if span else '',
         )
@@ -151,13 +142,13 @@ def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
         f'{name} ({count(size)} bytes)' for name, size in data['attachments'].items()
     )
     damaged = data['damaged_chunks'] and counted(data['damaged_chunks'], 'place')
-    return lines(
+    return command.lines(
         data['log'],
         span,
-        columns(topics, ['topic', 'type', 'messages', 'rate']) if topics else '',
-        columns(rows, head) if rows else '',
+        command.table(topics, ['topic', 'type', 'messages', 'rate']),
+        command.table(rows, head),
         f'Not in the log: {", ".join(absent)}.' if absent else '',
-        rejected_words(data['readings']),
+        command.rejected_words(data['readings']),
         *found,
         'No gaps.' if signals and not found else '',
         f'Attached: {attached}.' if attached else '',
@@ -244,7 +235,6 @@ def _facts(
     """Return the description of one signal, in the unit of the engine."""
     import numpy as np
 
-    from valveflow_ros.records import SIGNALS
     from valveflow_ros.report.data import gaps
     from valveflow_ros.signals.units import engine_unit
 
@@ -258,7 +248,6 @@ def _facts(
         (known.min(), np.median(known), known.max()) if len(known) else (np.nan,) * 3
     )
     return {
-        'topic': SIGNALS[signal].topic,
         'source': 'constant' if signal in log.constants else log.name_of(signal),
         'unit': engine_unit(signal, log.units.get(signal, '')),
         'readings': len(values),

@@ -7,18 +7,12 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_table,
-    columns,
-    lines,
-    table_words,
-)
+from valveflow_ros.cli import command
 from valveflow_ros.errors import UsageError
 from valveflow_ros.interface.files import check_folder
 
-_DESCRIPTION = """\
+USAGE = 'TABLE -o DIR [options]'
+DESCRIPTION = """\
 Judge the valve of one control loop from the controller's output and the measured position, or
 from the controller's output and the process value alone: it sticks, it has slack, the loop
 oscillates for another reason, it is sound, or the record cannot tell. At least 200 rows are
@@ -31,16 +25,11 @@ with column names that the program cannot recognise:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow loop TABLE -o DIR [options]'
+    """Add the options."""
     parser.add_argument(
         'table', metavar='TABLE', type=Path, help='a .csv or other text, .xlsx or .parquet table'
     )
-    parser.add_argument(
-        '-o', '--output', metavar='DIR', type=Path, required=True,
-        help='folder for loop.json, made if absent',
-    )  # fmt: skip
+    command.add_output(parser, 'DIR', 'folder for loop.json, made if absent')
     for option, about in (
         ('command', "the controller's output in %% (by default a column named OP, MV, ...)"),
         ('position', 'the measured position in %%; with it the sizes of the faults are estimated'),
@@ -49,10 +38,10 @@ def arguments(parser: ArgumentParser) -> None:
         ('time', 'date and time, or Unix seconds'),
     ):
         parser.add_argument(f'--{option}', metavar='COLUMN', default='', help=about)
-    add_table(parser, 'said')
+    command.add_table(parser, 'said')
 
 
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Read the table, judge, write."""
     from valveflow_ros.interface.loop import judge_loop
     from valveflow_ros.interface.mapping import table_options
@@ -63,7 +52,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     found = judge_loop(
         options.table, command=options.command, position=options.position,
         process=options.process, set_point=options.set_point, time=options.time,
-        options=table_options(table_words(options.said)), progress=console,
+        options=table_options(command.table_words(options.said)), progress=console,
     )  # fmt: skip
     path = found.write(options.output)
     content = found.to_json()
@@ -75,11 +64,11 @@ def run(options: Namespace, console: Console) -> VerbResult:
         for key, s in found.judgement.sizes.items()
     ]
     taken = ', '.join(f'{role} {theirs}' for role, theirs in found.names.items())
-    text = lines(
+    text = command.lines(
         f'{options.table.name}: {verdict.replace("_", " ")}.',
         content['reason'],
-        columns(sizes, ['size', 'value', '95 %', '']) if sizes else '',
+        command.table(sizes, ['size', 'value', '95 %', '']),
         f'Columns: {taken}; {content["rows"]} rows.',
         f'Wrote {path}.',
     )
-    return VerbResult(text, {**content, 'files': {path.name: str(path)}})
+    return command.VerbResult(text, {**content, 'files': {path.name: str(path)}})

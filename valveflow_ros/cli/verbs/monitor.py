@@ -5,28 +5,15 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_analysis,
-    add_analysis_options,
-    add_covariate,
-    checked_parameters,
-    columns,
-    covariates_of,
-    lines,
-    log_of,
-    mapping_of,
-    write_results,
-)
+from valveflow_ros.cli import command
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.monitor import MonitorResult
 
-_DESCRIPTION = """\
+USAGE = 'LOG -o DIR [options]'
+DESCRIPTION = """\
 Run the monitor over a recorded log, as fast as possible: the curves, alarms and diagnoses that
 the live monitor would have given. Use it to choose alarm parameters before the monitor runs
 live. DIR gets report.html for people and monitor.json for programs.
@@ -46,42 +33,36 @@ with the condenser pressure, which the diagnoses try as a cause:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow monitor LOG -o DIR [options]'
-    add_analysis(parser)
-    parser.add_argument(
-        '--model', metavar='FILE', type=Path,
-        help='an extended_model.json of diagnose: the effects of its causes are removed from the '
+    """Add the options."""
+    command.add_analysis(parser)
+    command.add_file(
+        parser,
+        '--model',
+        'an extended_model.json of diagnose: the effects of its causes are removed from the '
         'rows first',
-    )  # fmt: skip
-    parser.add_argument(
-        '--reference', metavar='FILE', type=Path,
-        help='a characteristic.json of the healthy plant',
-    )  # fmt: skip
+    )
+    command.add_file(parser, '--reference', 'a characteristic.json of the healthy plant')
     parser.add_argument(
         '--no-diagnosis', action='store_true',
         help='leave out the diagnoses, each of which takes as long as `valveflow diagnose`',
     )  # fmt: skip
-    add_covariate(parser)
-    add_analysis_options(parser)
+    command.add_covariate(parser)
+    command.add_analysis_options(parser)
 
 
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Open the log, run the monitor, write."""
-    mapping = mapping_of(options)
-    covariates = covariates_of(options)
-    console(0.0, 'starting')
+    covariates = command.covariates_of(options)
+    log = command.log_of(options, console)
     from valveflow_ros.interface.monitor import monitor
 
-    given = checked_parameters(options)
-    log = log_of(options, mapping, console)
     found = monitor(
-        log, parameters=given, model=options.model, reference=options.reference,
-        diagnose=not options.no_diagnosis, covariates=covariates or None, progress=console,
+        log, parameters=command.checked_parameters(options), model=options.model,
+        reference=options.reference, diagnose=not options.no_diagnosis,
+        covariates=covariates or None, progress=console,
     )  # fmt: skip
     console(0.95, 'writing the report')
-    return write_results(found, options, _text(found), found.to_json())
+    return command.write_results(found, options, _text(found), found.to_json())
 
 
 def _text(found: MonitorResult) -> str:
@@ -101,17 +82,17 @@ def _text(found: MonitorResult) -> str:
         [moment(at), VERDICT_WORDS[d['verdict']], ', '.join(c['name'] for c in d['causes']) or '-']
         for at, d in found.diagnoses
     ]
-    return lines(
+    return command.lines(
         f'{found.source}: {moment(found.start_ns)} to {moment(found.end_ns)}',
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
-        columns(alarms, ['alarm', 'raised', 'cleared', 'state at the end']) if alarms else '',
+        command.table(alarms, ['alarm', 'raised', 'cleared', 'state at the end']),
         *(sentence for _, sentence in found.standing),
         found.evidence_words,
-        columns(diagnoses, ['diagnosis', 'verdict', 'causes']) if diagnoses else '',
+        command.table(diagnoses, ['diagnosis', 'verdict', 'causes']),
         *found.named,
         *(f'The last diagnosis: {d["sentence"]}' for _, d in found.diagnoses[-1:]),
         *found.advice,
         found.reference_words,
         found.wear_words,
-    )  # fmt: skip
+    )

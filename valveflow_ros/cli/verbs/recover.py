@@ -7,9 +7,10 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from valveflow_ros.cli.command import Console, VerbResult
+from valveflow_ros.cli.command import Console, VerbResult, add_output
 
-_DESCRIPTION = """\
+USAGE = 'BROKEN -o LOG [options]'
+DESCRIPTION = """\
 Repair a recording that a crash, a full disk or a bad sector has left: everything that is
 intact is copied and gets a new index, what is damaged is left out and counted. Nothing is
 guessed, and the broken file is not changed.
@@ -19,13 +20,9 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow recover BROKEN -o LOG [options]'
+    """Add the options."""
     parser.add_argument('broken', metavar='BROKEN', type=Path, help='an .mcap or .mcap.part file')
-    parser.add_argument(
-        '-o', '--output', metavar='LOG', type=Path, required=True, help='the whole .mcap file'
-    )
+    add_output(parser, 'LOG', 'the whole .mcap file')
 
 
 def run(options: Namespace, console: Console) -> VerbResult:

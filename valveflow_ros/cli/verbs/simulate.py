@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import Console, VerbResult, time_ns
+from valveflow_ros.cli.command import Console, VerbResult, add_file, add_output, time_ns
 from valveflow_ros.errors import InputError, UsageError, listed
 from valveflow_ros.interface.files import check_log
 from valveflow_ros.report.terminal.text import number, whole
@@ -18,7 +17,8 @@ if TYPE_CHECKING:
     from valveflow_ros.plant.simulator import SimulatedLog
     from valveflow_ros.plant.thermal_plant import ThermalLog
 
-_DESCRIPTION = """\
+USAGE = '-o LOG [options]'
+DESCRIPTION = """\
 Simulate the unit of the paper's study: a 300 MW unit under load control, with sliding
 pressure, pulses of the primary frequency control and noise, recorded once a second. An effect
 is a known fault of the unit, to see whether the program finds it.
@@ -45,13 +45,9 @@ that unit."""
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow simulate -o LOG [options]'
-    parser.add_argument(
-        '-o', '--output', metavar='LOG', type=Path,
-        help='where to write: .mcap, .csv, .parquet, or a folder as ros2 bag makes it',
-    )  # fmt: skip
+    """Add the options."""
+    told = 'where to write: .mcap, .csv, .parquet, or a folder as ros2 bag makes it'
+    add_output(parser, 'LOG', told, required=False)
     parser.add_argument(
         '--days', metavar='D', type=number('a number of days', 0, 400, '--days 10', above=True),
         default=10.0, help='how many days of operation, such as 0.5 (default 10)',
@@ -76,10 +72,11 @@ def arguments(parser: ArgumentParser) -> None:
         '--effect', action='append', default=[], metavar='NAME[:KEY=VALUE,...]',
         help='simulate this effect (a fault); may be given several times',
     )  # fmt: skip
-    parser.add_argument(
-        '--truth', metavar='FILE', type=Path,
-        help='also write the true values of the plant, as JSON; the log does not contain them',
-    )  # fmt: skip
+    add_file(
+        parser,
+        '--truth',
+        'also write the true values of the plant, as JSON; the log does not contain them',
+    )
     parser.add_argument('--effects', action='store_true', help='list the effects, then stop')
     parser.add_argument('--overwrite', action='store_true', help='replace a log that is there')
 
@@ -92,6 +89,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
         raise UsageError('Where to? Name the log with -o LOG.')
     check_log(options.output, overwrite=options.overwrite)
     from valveflow_ros.interface.simulate import simulate
+    from valveflow_ros.logs.mcap.folder import METADATA_NAME
+    from valveflow_ros.logs.mcap.importing import tells_of
     from valveflow_ros.plant.simulator import DEFAULT_START_NS
 
     start_ns = DEFAULT_START_NS if options.start is None else time_ns(options.start)
@@ -106,19 +105,11 @@ def run(options: Namespace, console: Console) -> VerbResult:
     console(0.6, 'writing')
     log = found.write(options.output, truth=options.truth, overwrite=options.overwrite)
     data = {'log': str(log), 'rows': len(found.data), **found.to_json()}
-    wrote = f'Wrote {listed(_written(log, options.truth))}.'
+    written = [log, log.with_name(METADATA_NAME), options.truth]
+    if not (written[1].is_file() and tells_of(written[1], log.name)):
+        del written[1]  # that of another recording stays as it is
+    wrote = f'Wrote {listed([str(path) for path in written if path])}.'
     return VerbResult(wrote if options.quiet else f'{_text(found)}\n{wrote}', data)
-
-
-def _written(log: Path, truth: Path | None) -> list[str]:
-    """Return the files that were written; a recording has a metadata.yaml beside it."""
-    from valveflow_ros.logs.mcap.folder import METADATA_NAME
-    from valveflow_ros.logs.mcap.importing import tells_of
-
-    beside = log.with_name(METADATA_NAME)
-    # That of another recording stays as it is.
-    found = [log, *([beside] if beside.is_file() and tells_of(beside, log.name) else [])]
-    return [str(path) for path in (*found, *([truth] if truth else []))]
 
 
 def _catalogue(unit: str) -> VerbResult:

@@ -5,27 +5,16 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from valveflow_ros.cli.command import (
-    Console,
-    VerbResult,
-    add_analysis,
-    add_analysis_options,
-    checked_parameters,
-    columns,
-    lines,
-    log_of,
-    mapping_of,
-    write_results,
-)
+from valveflow_ros.cli import command
 from valveflow_ros.report.terminal.text import number
 
 if TYPE_CHECKING:
     from valveflow_ros.report.validation import Validated
 
-_DESCRIPTION = """\
+USAGE = 'LOG --model FILE -o DIR [options]'
+DESCRIPTION = """\
 Compare a characteristic with a log it was not made from: in each steady-state and
 slope-response segment of the log, how far is the measured power from the predicted one?
 Says whether the curve holds, is off (and on which piece), or cannot be told. DIR gets
@@ -36,49 +25,44 @@ example:
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow validate LOG --model FILE -o DIR [options]'
-    add_analysis(parser, 'the log to compare with')
-    parser.add_argument(
-        '--model', metavar='FILE', type=Path, required=True,
-        help='a characteristic.json of identify, or an extended_model.json of diagnose',
-    )  # fmt: skip
-    parser.add_argument(
-        '--against', metavar='FILE', type=Path,
-        help='a second characteristic.json, to see which of the two is better',
-    )  # fmt: skip
+    """Add the options."""
+    command.add_analysis(parser, 'the log to compare with')
+    command.add_file(
+        parser,
+        '--model',
+        'a characteristic.json of identify, or an extended_model.json of diagnose',
+        required=True,
+    )
+    command.add_file(
+        parser, '--against', 'a second characteristic.json, to see which of the two is better'
+    )
     parser.add_argument(
         '--tolerance', metavar='MW',
         type=number('a power in MW', 0, 10_000, '--tolerance 2', above=True),
         help='a mean difference that does not matter (default: the parameter alarm_floor, 1 MW)',
     )  # fmt: skip
-    add_analysis_options(parser)
+    command.add_analysis_options(parser)
 
 
-def run(options: Namespace, console: Console) -> VerbResult:
+def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Open the log, find segments, judge, write."""
-    mapping = mapping_of(options)
-    console(0.0, 'starting')
-    from valveflow_ros.interface.compare import check_models, validate
+    log = command.log_of(options, console)
+    from valveflow_ros.interface.compare import validate
     from valveflow_ros.report.validation import verdict_words
 
-    given = checked_parameters(options)
-    check_models(options.model, options.against, given)
-    log = log_of(options, mapping, console)
     found = validate(
         log, options.model, against=options.against, tolerance_mw=options.tolerance,
-        parameters=given, progress=console,
+        parameters=command.checked_parameters(options), progress=console,
     )  # fmt: skip
     console(0.9, 'writing the report')
     data = found.data
-    text = lines(
+    text = command.lines(
         f'{data.model}, compared with {data.source}:', *verdict_words(data), data.held,
         _pieces(data), _errors(data),
     )  # fmt: skip
     # The segments are only written to the file.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
-    return write_results(found, options, text, brief)
+    return command.write_results(found, options, text, brief)
 
 
 def _pieces(data: Validated) -> str:
@@ -96,14 +80,8 @@ def _pieces(data: Validated) -> str:
         for k, c in enumerate((v.overall, *v.pieces))
     ]
     m = v.characteristic.pressure_exponent
-    head = [
-        'piece',
-        f'{input_name(m)} ({input_unit_plain(m)})',
-        'segments',
-        'measured - predicted (MW)',
-        '95 % (MW)',
-    ]
-    return columns(rows, head)
+    head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})', 'segments']
+    return command.columns(rows, [*head, 'measured - predicted (MW)', '95 % (MW)'])
 
 
 def _errors(data: Validated) -> str:
@@ -117,4 +95,4 @@ def _errors(data: Validated) -> str:
         [LABELS[name], *(plain(j.mse(name, k)) if j.kinds(k) else '-' for k in kinds)]
         for name in data.result.predictions
     ]
-    return columns(rows, ['mean squared error (MW^2)', 'segments', 'steady', 'slope'])
+    return command.columns(rows, ['mean squared error (MW^2)', 'segments', 'steady', 'slope'])

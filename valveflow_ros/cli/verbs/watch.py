@@ -23,7 +23,8 @@ _MODULE, _PAGE_MODULE = 'valveflow_ros.ros.watch_main', 'valveflow_ros.ros.page_
 _DAY = 86_400
 _TABLES = ('.csv', '.tsv', '.txt', '.parquet', '.pq', '.xlsx')
 
-_DESCRIPTION = """\
+USAGE = '[LOG] [options]'
+DESCRIPTION = """\
 Show the state of a monitor, updated every second: the curve with today's operating point,
 its age, the last residuals with their limits, alarms, inputs, recorder and diagnosis. With a
 LOG it follows the recording of a monitor while it grows, also into further files; without one
@@ -42,9 +43,7 @@ prometheus-client waitress."""
 
 
 def arguments(parser: ArgumentParser) -> None:
-    """Add description, example and options."""
-    parser.description = _DESCRIPTION
-    parser.usage = 'valveflow watch [LOG] [options]'
+    """Add the options."""
     parser.add_argument(
         'log', metavar='LOG', type=Path, nargs='?',
         help='an .mcap or .mcap.part file, the folder of a recording, or a folder of recordings',
@@ -55,20 +54,16 @@ def arguments(parser: ArgumentParser) -> None:
         type=number('a number of seconds', 0.1, 3600, '--interval 5'),
         help='seconds between two pictures (default 1)',
     )  # fmt: skip
-    parser.add_argument(
-        '--node', metavar='NAME',
-        help='which monitor to listen to over ROS 2, such as /unit1/valveflow_monitor; '
-        'found by itself where there is one',
-    )  # fmt: skip
-    parser.add_argument(
-        '--ask', metavar='SERVICE',
-        help='call a service of the monitor: acknowledge_alarms, shelve_alarms, unshelve_alarms, '
-        'set_reference, refit or diagnose; print its answer, then stop',
-    )  # fmt: skip
-    parser.add_argument(
-        '--alarm', metavar='NAME',
-        help='with --ask for alarms: only this one, residual or curve_shift',
-    )  # fmt: skip
+    for option, metavar, told in (
+        ('node', 'NAME',
+         'which monitor to listen to over ROS 2, such as /unit1/valveflow_monitor; found by '
+         'itself where there is one'),
+        ('ask', 'SERVICE',
+         'call a service of the monitor: acknowledge_alarms, shelve_alarms, unshelve_alarms, '
+         'set_reference, refit or diagnose; print its answer, then stop'),
+        ('alarm', 'NAME', 'with --ask for alarms: only this one, residual or curve_shift'),
+    ):  # fmt: skip
+        parser.add_argument(f'--{option}', metavar=metavar, help=told)
     parser.add_argument(
         '--page', action='store_true', help='show it on a page in the browser; options for it:'
     )
@@ -81,12 +76,13 @@ def run(options: Namespace, console: Console) -> VerbResult:
     _check_together(options)
     if options.log is None:
         _watch_ros(options)
-    if options.node is not None:
-        raise UsageError('--node chooses a running monitor and does not go with a LOG.')
-    if options.alarm is not None:
-        raise UsageError('--alarm goes with --ask.')
-    if options.ask is not None:
-        raise UsageError('--ask is for a running monitor and does not go with a LOG.')
+    for option, told in (
+        ('node', '--node chooses a running monitor and does not go with a LOG.'),
+        ('alarm', '--alarm goes with --ask.'),
+        ('ask', '--ask is for a running monitor and does not go with a LOG.'),
+    ):
+        if getattr(options, option) is not None:
+            raise UsageError(told)
     if options.log.suffix.lower() in _TABLES:
         raise UsageError(
             f'{options.log} is a table, which does not grow: look into it with '
@@ -98,15 +94,13 @@ def run(options: Namespace, console: Console) -> VerbResult:
 def _check_together(options: Namespace) -> None:
     """Raise `UsageError` for options that exclude each other."""
     if options.page:
-        asked = (options.ask, options.alarm)
-        if options.once or options.json or any(option is not None for option in asked):
+        if options.once or options.json or options.ask is not None or options.alarm is not None:
             raise UsageError('--page does not go with --once, --json, --ask or --alarm.')
         if options.log is not None and options.token_file is not None:
             raise UsageError('--token-file is for a running monitor and does not go with a LOG.')
         check_installed()
         return
-    given = (options.on_alarm, options.webhook, options.token_file)
-    if any(option is not None for option in given) or options.name:
+    if (options.on_alarm, options.webhook, options.token_file) != (None,) * 3 or options.name:
         raise UsageError('--on-alarm, --webhook, --token-file and --name go with --page.')
 
 
@@ -128,14 +122,9 @@ def _page_of_log(options: Namespace, console: Console) -> VerbResult:
     try:
         with ending():
             server = PageServer(
-                shown,
-                options.host,
-                options.port,
-                options.name,
-                counters=notices.counters,
-                complain=console.warn,
-                zone=zone_of(options.time_zone),
-            )
+                shown, options.host, options.port, options.name, counters=notices.counters,
+                complain=console.warn, zone=zone_of(options.time_zone),
+            )  # fmt: skip
             console.say(f'The page is at {server.address}')
             while True:
                 for _ in watch.read():
@@ -185,8 +174,7 @@ def _watch_log(options: Namespace, console: Console) -> VerbResult:
                     break
                 time.sleep(options.interval)
         except KeyboardInterrupt:
-            # The usual end.
-            return VerbResult('', {})
+            pass  # the usual end
     return VerbResult('', {})
 
 
@@ -200,30 +188,17 @@ def _watch_ros(options: Namespace) -> NoReturn:
             'valveflow watch valveflow_recordings.'
         )
     if options.page:
-        _become(_PAGE_MODULE, _page_words(options))
-    words = ['--interval', str(options.interval)]
-    words += ['--once'] if options.once else []
-    words += ['--json'] if options.json else []
-    words += ['--node', options.node] if options.node else []
-    words += ['--ask', options.ask] if options.ask else []
-    words += ['--alarm', options.alarm] if options.alarm else []
-    words += [f'--time-zone={options.time_zone}']
-    _become(_MODULE, words)
-
-
-def _page_words(options: Namespace) -> list[str]:
-    words = ['--host', options.host, '--port', str(options.port)]
-    words += [f'--time-zone={options.time_zone}']
-    for name in options.name:
-        words += ['--name', name]
-    for option in ('node', 'token_file', 'on_alarm', 'webhook'):
+        module, words = _PAGE_MODULE, ['--host', options.host, '--port', str(options.port)]
+        words += [word for name in options.name for word in ('--name', name)]
+        handed: tuple[str, ...] = ('node', 'token_file', 'on_alarm', 'webhook')
+    else:
+        module, words = _MODULE, ['--interval', str(options.interval)]
+        words += [f'--{name}' for name in ('once', 'json') if getattr(options, name)]
+        handed = ('node', 'ask', 'alarm')
+    for option in handed:
         given = getattr(options, option)
         words += [] if given is None else [f'--{option.replace("_", "-")}', str(given)]
-    return words
-
-
-def _become(module: str, words: list[str]) -> NoReturn:
-    """Replace this process by another module."""
     sys.stdout.flush()
     sys.stderr.flush()
+    words.append(f'--time-zone={options.time_zone}')
     os.execv(sys.executable, [sys.executable, '-m', module, *words])

@@ -7,7 +7,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -44,12 +44,7 @@ _WAIT_S, _SHOWN = 10, 4
 def connected(scheduler: str) -> Iterator[Any]:
     """Yield a client of a scheduler, or of a local cluster with one worker per core.
 
-    Raises
-    ------
-    InputError
-        The optional dependency is not installed.
-    RecordingError, UsageError
-        No scheduler answers at the address, or the address is invalid.
+    Raises `RecordingError` if no scheduler answers, `UsageError` if its address is none.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -99,22 +94,24 @@ def _silenced() -> Iterator[None]:
             logging.getLogger(name).setLevel(level)
 
 
-def workers_words(client: Any) -> str:
-    """Return a sentence with the number of workers and the memory limit of each."""
+def _tell_workers(client: Any, units: Mapping[str, Sequence[UnitLog]], progress: Progress) -> None:
+    """Report the workers, and the first tasks in the order in which they are distributed."""
     workers = client.scheduler_info(n_workers=-1)['workers'].values()
     if not workers:
-        return f'{client.scheduler.address} has no worker yet; waiting for one.'
-    limits = sorted({w['memory_limit'] or 0 for w in workers})
-    bound = 'without a bound of memory' if not limits[0] else (
-        f'each bounded to {limits[0] / 1e9:.1f} GB of memory'
-    )  # fmt: skip
-    return f'{counted(len(workers), "worker")}, {bound}.'
-
-
-def _threads(client: Any) -> int:
-    """Return the number of tasks that the workers run in parallel."""
-    workers = client.scheduler_info(n_workers=-1)['workers'].values()
-    return sum(w['nthreads'] for w in workers)
+        progress.say(f'{client.scheduler.address} has no worker yet; waiting for one.')
+        return
+    limit = min(w['memory_limit'] or 0 for w in workers)
+    bound = (
+        f'each bounded to {limit / 1e9:.1f} GB of memory' if limit else 'without a bound of memory'
+    )
+    progress.say(f'{counted(len(workers), "worker")}, {bound}.')
+    progress.say(
+        'The workers begin. Where none has run before it compiles first, which takes minutes; the '
+        'next run does not.'
+    )
+    first = [f'{unit} {logs[0].name}' for unit, logs in units.items()]
+    at_once = min(_SHOWN, sum(w['nthreads'] for w in workers))
+    progress(0.0, f'first {listed(first[:at_once])}')
 
 
 Chain = Generator[FleetTask, Row, None]
@@ -125,20 +122,10 @@ def spread(
 ) -> Iterator[tuple[FleetTask, Row]]:
     """Run chains of tasks on the workers; yield each task with its row when it is done.
 
-    Parameters
-    ----------
-    client : distributed.Client
-    work : callable
-        Function that a worker calls with a task.
-    chains : sequence of generator
-        Each yields a task and receives its row by `send`. Each chain has at most one task on the
-        cluster: the scheduler has at most one task per unit, and finished work is not lost with
-        a worker. Chains with more finished tasks come first, so that units end one by one.
-
-    Raises
-    ------
-    ValveflowError
-        The connection to the scheduler is lost.
+    Each chain yields a task and receives its row by `send`. It has at most one task on the
+    cluster: the scheduler has at most one task per unit, and finished work is not lost with a
+    worker. Chains with more finished tasks come first, so that units end one by one. Raises
+    `ValveflowError` if the connection to the scheduler is lost.
     """
     from distributed import as_completed
 
@@ -358,15 +345,7 @@ def fleet(
     stories, done, total = [], 0, sum(map(len, units.values()))
     anew = failed = 0
     with connected(scheduler) as client:
-        progress.say(workers_words(client))
-        # The first tasks, in the order in which the scheduler distributes them.
-        first = [f'{unit} {logs[0].name}' for unit, logs in units.items()][: _threads(client)]
-        if first:
-            progress.say(
-                'The workers begin. Where none has run before it compiles first, which takes '
-                'minutes; the next run does not.'
-            )
-            progress(0.0, f'first {listed(first[:_SHOWN])}')
+        _tell_workers(client, units, progress)
         chains = [_chain(months, folder) for months in units.values()]
         for task, row in spread(client, unit_month, chains):
             unit, done = task.of.unit, done + 1

@@ -34,17 +34,9 @@ _SPLIT = re.compile(r'_\d+\.(mcap|db3)(\.zstd)?$')
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a log is read and evaluated.
+    """How a log is read and evaluated, also as ``text`` for the hash.
 
-    Attributes
-    ----------
-    mapping : LogMapping
-    parameters : dict
-        Parameters of the monitor by name.
-    diagnosis : bool
-        True if the monitor's own diagnoses are computed.
-    text : str
-        All options as text, for the hash.
+    ``diagnosis``: the monitor's own diagnoses are computed.
     """
 
     mapping: LogMapping
@@ -55,17 +47,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class UnitLog:
-    """One log of a unit, usually a month.
-
-    Attributes
-    ----------
-    unit : str
-    name : str
-        Name of the log, without its suffix.
-    log : Path
-        Absolute path.
-    options : Options
-    """
+    """One log of a unit, usually a month; its name has no suffix, its path is absolute."""
 
     unit: str
     name: str
@@ -76,16 +58,8 @@ class UnitLog:
 def read_options(words: Sequence[str]) -> Options:
     """Read options in the form of the verbs; a later option overrides an earlier equal one.
 
-    Parameters
-    ----------
-    words : sequence of str
-        ``--column``, ``--constant``, ``--set``, ``--params`` and the options of a table, each
-        followed by its value, and ``--no-diagnosis``.
-
-    Raises
-    ------
-    UsageError, InputError, RecordingError
-        An option is unknown or has no value, or a value is wrong.
+    They are ``--column``, ``--constant``, ``--set``, ``--params`` and the options of a table, each
+    followed by its value, and ``--no-diagnosis``.
     """
     said: dict[tuple[str, str], str] = {}
     rest = list(words)
@@ -104,7 +78,7 @@ def read_options(words: Sequence[str]) -> Options:
         said[option, name] = value
     columns, constants, pairs = ([v for (o, _), v in said.items() if o == p] for p in _PAIRED)
     table = {o[2:].replace('-', '_'): v for (o, _), v in said.items() if o in _TABLE}
-    file = said.get(('--params', ''))
+    file, no_diagnosis = said.get(('--params', '')), (_NO_DIAGNOSIS, '') in said
     parameters = read_parameters(None if file is None else Path(file).expanduser(), pairs)
     for name in _FILES:
         if parameters.get(name):
@@ -112,13 +86,9 @@ def read_options(words: Sequence[str]) -> Options:
                 f'{name} has no place in a fleet: the reference of a log is the curve of the one '
                 'before it.'
             )
-    text = json.dumps(
-        [sorted(columns), sorted(constants), sorted(table.items()), parameters,
-         (_NO_DIAGNOSIS, '') in said],
-        sort_keys=True,
-    )  # fmt: skip
+    given = [sorted(columns), sorted(constants), sorted(table.items()), parameters, no_diagnosis]
     mapping = read_mapping(columns, constants, **table)
-    return Options(mapping, parameters, (_NO_DIAGNOSIS, '') not in said, text)
+    return Options(mapping, parameters, not no_diagnosis, json.dumps(given, sort_keys=True))
 
 
 def read_fleet(
@@ -136,11 +106,6 @@ def read_fleet(
         Options of all logs; see `read_options`. Options in a manifest override them.
     output : Path, optional
         The folder of results; logs in it are ignored.
-
-    Raises
-    ------
-    RecordingError, InputError
-        A log does not exist, a manifest cannot be read, or two units have the same name.
     """
     found: dict[str, list[UnitLog]] = {}
     origin: dict[str, tuple[str, object]] = {}
@@ -162,7 +127,7 @@ def read_fleet(
             if other.name == name:
                 raise InputError(
                     f'{log} was given twice.'
-                    if other.log.resolve() == log.resolve()
+                    if other.log == log
                     else f"Unit '{unit}' has two logs of one name, {other.log} and {log}: give "
                     'two units two names, or rename one of the logs.'
                 )

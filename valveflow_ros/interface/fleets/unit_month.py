@@ -50,7 +50,6 @@ class FleetTask:
 
     Attributes
     ----------
-    of : UnitLog
     folder : Path
         The folder of results, which all workers must see.
     before, first : str
@@ -266,12 +265,10 @@ def _shift_facts(name: str, shift: Shift | None, unit: str) -> Row:
     if shift is None:
         return {}
     worst = shift.largest
+    size = {'mw': 'shift_mw', 'u_from': 'u_from', 'u_to': 'u_to', 'p_value': 'p_value'}
     return {
         f'{name}_moved': shift.moved,
-        f'{name}_mw': None if worst is None else worst.shift_mw,
-        f'{name}_u_from': None if worst is None else worst.u_from,
-        f'{name}_u_to': None if worst is None else worst.u_to,
-        f'{name}_p_value': None if worst is None else worst.p_value,
+        **{f'{name}_{k}': worst and getattr(worst, of) for k, of in size.items()},
         f'{name}_since': shift.since_ns or None,
         f'{name}_since_low': shift.since_low_ns or None,
         f'{name}_since_high': shift.since_high_ns or None,

@@ -16,41 +16,34 @@ import numpy as np
 from valveflow_ros.errors import DataError, RecordingError, counted
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.files import reason
+from valveflow_ros.interface.plausibility import joined
 from valveflow_ros.logs.mcap.importing import WrittenLog, write_readings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Readings, Signal
 
 # Length of a part; after a stop at most one part is read again.
 _PART_NS = 4 * 3600 * NS_PER_S
 _SUFFIX = '.parts'
+_COLUMNS = ('time_ns', 'signal', 'value', 'quality')
 
 
 class HistorySource(Protocol):
     """A source of history; support for a new historian only needs these members.
 
-    Attributes
-    ----------
-    name : str
-        Its name in messages and in the log: an address without a password.
-    columns : mapping of Signal to str
-        The available signals with their name and unit in the historian. A stopped import is
-        continued only if ``name`` and ``columns`` have not changed.
+    A stopped import is continued only if ``name`` and ``columns`` have not changed.
     """
 
     @property
     def name(self) -> str:
-        """Return its name in messages."""
+        """Return its name in messages and in the log: an address without a password."""
 
     @property
     def columns(self) -> Mapping[Signal, str]:
-        """Return the names of the signals in the historian."""
+        """Return the available signals with their name and unit in the historian."""
 
     def read(self, start_ns: int, end_ns: int) -> list[Readings]:
         """Return the readings of ``[start_ns, end_ns)`` in chronological order, in engine units.
 
-        Raises
-        ------
-        DataError
-            The historian cannot be reached, or has no such signal or no history.
+        Raises `DataError` if it cannot be reached, or has no such signal or no history.
         """
 
 
@@ -70,7 +63,6 @@ def import_history(
 
     Parameters
     ----------
-    source : HistorySource
     start_ns, end_ns : int
         The period, ns since 1970; the end is excluded.
     path : str or Path
@@ -106,7 +98,8 @@ def import_history(
             if not file.exists():
                 _save(file, source.read(begin_ns, min(begin_ns + _PART_NS, end_ns)))
         progress(0.9, 'writing')
-        units = [{'topic': topic, 'unit': SIGNALS[s].unit} for s, topic in _topics(source)]
+        infos = [SIGNALS[signal] for signal in sorted(source.columns)]
+        units = [{'topic': info.topic, 'unit': info.unit} for info in infos]
         if not any(len(_load(file)) for file in files):
             shutil.rmtree(folder, ignore_errors=True)  # a later call may find values
             raise DataError(f'{source.name} has no value in this period.')
@@ -122,25 +115,17 @@ def import_history(
     return written
 
 
-def _topics(source: HistorySource) -> list[tuple[Signal, str]]:
-    return [(signal, SIGNALS[signal].topic) for signal in sorted(source.columns)]
-
-
 def _save(file: Path, parts: list[Readings]) -> None:
     """Write a part and give it its final name when it is complete."""
-    part = file.with_suffix('.tmp')
-    columns = {
-        name: np.concatenate([getattr(p, name) for p in parts])
-        for name in ('time_ns', 'signal', 'value', 'quality')
-    }
+    part, whole = file.with_suffix('.tmp'), joined(parts)
     with part.open('wb') as out:
-        np.savez(out, **columns)  # type: ignore[arg-type]
+        np.savez(out, **{name: getattr(whole, name) for name in _COLUMNS})
     part.replace(file)
 
 
 def _load(file: Path) -> Readings:
     try:
         with np.load(file, allow_pickle=False) as columns:
-            return Readings(*(columns[name] for name in ('time_ns', 'signal', 'value', 'quality')))
+            return Readings(*(columns[name] for name in _COLUMNS))
     except (ValueError, KeyError, EOFError, BadZipFile):
         raise RecordingError(file, 'is damaged; remove it, and it is read again') from None

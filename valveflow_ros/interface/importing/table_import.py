@@ -18,19 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valveflow_ros.errors import DataError, RecordingError
-from valveflow_ros.interface import Progress
+from valveflow_ros.interface import Progress, plausibility
 from valveflow_ros.interface.files import reason
 from valveflow_ros.interface.logs import Series, read_series
 from valveflow_ros.interface.mapping import LogMapping, merge_refusals
-from valveflow_ros.interface.plausibility import (
-    air_note,
-    check_constants,
-    doubt,
-    limits_beside_steam,
-    refuse_guesses,
-    refuse_impossible,
-    with_constants,
-)
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.reader import RawBlock, TableReader
 from valveflow_ros.logs.tables.refusal import RefusedError
@@ -53,17 +44,16 @@ from valveflow_ros.signals.units import convert, engine_unit
 
 _SAMPLE = 500_000  # values that are enough to check a unit
 _ROWS = 200_000  # in memory at a time
-_BY_COLUMN = {info.column: info for info in SIGNALS}
+_SIGNALS = {info.column: info.signal for info in SIGNALS}
 
 
 @dataclass(frozen=True, slots=True)
 class SignalSource:
     """The column of one signal; ``low`` and ``high`` in the engine's unit.
 
-    ``words`` counts the texts that are found in place of numbers, the most frequent
-    first; ``empty`` counts the cells without a value; ``ground`` says why the column
-    was chosen, if it was not named; ``air`` describes the air pressure that is added
-    to a gauge pressure.
+    ``words`` counts the texts in place of numbers, the most frequent first, and ``empty`` the
+    cells without a value; ``ground`` says why the column was chosen, if it was not named; ``air``
+    describes the air pressure that is added to a gauge pressure.
     """
 
     topic: str
@@ -107,27 +97,19 @@ class _Statistics:
         return np.concatenate([*self._parts, np.array([self.low, self.high])])
 
 
-class Spool:
-    """Columns in unnamed temporary files, which end with the process.
+# Times, row numbers in the file, columns, qualities.
+_Block = tuple[IntArray, slice | IntArray, dict[Signal, FloatArray], dict[Signal, ByteArray]]
 
-    Parameters
-    ----------
-    folder : Path
-        A folder with enough space: that of the log to be written.
-    """
+
+class Spool:
+    """Columns in unnamed temporary files in a folder with enough space: that of the log."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._files: dict[str, tuple[IO[bytes], np.dtype[Any]]] = {}
 
     def append(self, name: str, values: NDArray[Any]) -> None:
-        """Add values to the end of a column.
-
-        Raises
-        ------
-        RecordingError
-            The disk is full.
-        """
+        """Add values to the end of a column; `RecordingError` if the disk is full."""
         try:
             if name not in self._files:
                 file: IO[bytes] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115
@@ -160,12 +142,6 @@ class TableImport:
 
     Parameters
     ----------
-    path : Path
-        The table.
-    mapping : LogMapping
-        What the user specified about the table.
-    progress : Progress
-        Receives the interpretation of the table and the warnings.
     covariates : mapping of str to str
         Further columns to keep, by the topic: ``COLUMN`` or ``COLUMN:unit``.
     strict : bool
@@ -179,16 +155,12 @@ class TableImport:
         their time occurred before.
     period_s : float
         Median step of time.
-    span_ns : tuple of int
-        First and last time, ns since 1970.
     gaps : list of Gap
         The longest first.
     ignored, numeric_ignored : tuple of str
         Columns that were not used; those of them that hold different numbers.
     further : dict of str to Series
         The covariates by topic; complete when the table was read.
-    notes : tuple of str
-        Sentences of the reader.
     time_zone, time_words : str
         The assumed time zone, and a description of the format of the times.
     is_long : bool
@@ -219,24 +191,24 @@ class TableImport:
         self.further: dict[str, Series] = {}
         self._constants = mapping.constant_signals
         names = self._reader.names
-        told = {_BY_COLUMN[n].signal: unit for n, unit in self._reader.units.items()}
-        self._units = {name: mapping.unit_of(_BY_COLUMN[name].signal, told) for name in names}
-        measured = {_BY_COLUMN[name].signal: unit for name, unit in self._units.items()}
+        told = {_SIGNALS[n]: unit for n, unit in self._reader.units.items()}
+        self._units = {name: mapping.unit_of(_SIGNALS[name], told) for name in names}
+        measured = {_SIGNALS[name]: unit for name, unit in self._units.items()}
         self._stated = {**measured, **mapping.constant_units}
-        self._limits = Settings(limits_beside_steam(self._stated, self._constants))
-        check_constants(self._constants, self._limits)
+        self._limits = Settings(plausibility.limits_beside_steam(self._stated, self._constants))
+        plausibility.check_constants(self._constants, self._limits)
         self._output = engine_unit(
             Signal.GENERATED_POWER, self._stated.get(Signal.GENERATED_POWER, '')
         )
         progress.measured_in(self._output)
-        self._used = [n for n in names if _BY_COLUMN[n].signal not in self._constants]
+        self._used = [n for n in names if _SIGNALS[n] not in self._constants]
         self._spool: Spool | None = None
         self._statistics = {name: _Statistics() for name in self._used}
         self._time_ns: IntArray = np.empty(0, np.int64)
         # Rows to use, in chronological order; None: all rows in the order of the file.
         self._order: IntArray | None = None
-        unused = (names[n] for n in names if n not in self._used)
-        self.ignored = (*self._reader.ignored, *unused)
+        unused = [n for n in names if n not in self._used]
+        self.ignored = (*self._reader.ignored, *(names[n] for n in unused))
         self.rows_read = self.rows = self.duplicates = 0
         self.period_s, self.span_ns = 0.0, (0, 0)
         self.gaps: list[Gap] = []
@@ -244,25 +216,22 @@ class TableImport:
         self.time_zone, self.time_words = '', ''
         self.is_long = self._reader.long is not None
         self.numeric_ignored: tuple[str, ...] = ()
-        for name in (n for n in names if n not in self._used):
+        for name in unused:
             progress.warn(
-                f"{_BY_COLUMN[name].topic} stands in the table as '{names[name]}' too; the "
+                f"{SIGNALS[_SIGNALS[name]].topic} stands in the table as '{names[name]}' too; the "
                 'constant is used instead.'
             )
 
     @property
     def signals(self) -> list[Signal]:
         """Return the signals that will have readings."""
-        return sorted({*(_BY_COLUMN[name].signal for name in self._used), *self._constants})
+        return sorted({*(_SIGNALS[name] for name in self._used), *self._constants})
 
     def read(self, spool: Spool | None) -> None:
         """Read the whole table and check it; store the values in the spool unless it is a trial.
 
-        Raises
-        ------
-        RecordingError, InputError, DataError
-            As in the constructor; or no row is usable, or the values of a column
-            contradict the signal or unit assumed for it.
+        Raises as the constructor; also if no row is usable, or the values of a column contradict
+        the signal or unit assumed for it.
         """
         reader = self._reader
         times: list[IntArray] = []
@@ -286,11 +255,13 @@ class TableImport:
             refused.append(error)
         self._time_ns = np.concatenate(times)
         notes += self._sort()
-        for note in filter(None, notes):
-            self._progress.say(note)
-        for name in self._used:  # the result says them
-            notes.append(air_note(_BY_COLUMN[name].signal, self._units[name], reader.names[name]))
         notes = [note for note in notes if note]
+        for note in notes:
+            self._progress.say(note)
+        airs = (
+            plausibility.air_note(_SIGNALS[n], self._units[n], reader.names[n]) for n in self._used
+        )
+        notes += filter(None, airs)  # the result says them
         if all(np.isnan(found.low) for found in self._statistics.values()):
             raise DataError(f'{reader.path}: there is no number in any of the columns used.')
         self._judge(refused)
@@ -322,7 +293,7 @@ class TableImport:
             yield from map(table_to_readings, self.tables())
             return
         assert self._spool is not None
-        signals = np.array([_BY_COLUMN[name].signal for name in self._used], np.int8)
+        signals = np.array([_SIGNALS[name] for name in self._used], np.int8)
         for time_ns, rows, columns, quality in self._blocks():
             table = SampleTable.from_columns(time_ns, columns, quality)
             there = [self._spool.take(f'{name}?', rows) for name in self._used]
@@ -331,7 +302,7 @@ class TableImport:
             readings = Readings(
                 time_ns[row], signal, table.values[row, signal], table.quality[row, signal]
             )
-            yield with_constants(readings, self._constants)
+            yield plausibility.with_constants(readings, self._constants)
 
     def sources(self) -> list[SignalSource]:
         """Return the source of each signal, in the order of `Signal`."""
@@ -344,11 +315,8 @@ class TableImport:
                 value = self._constants[info.signal]
                 sources.append(SignalSource(info.topic, '', unit, unit, value, value, 0, True))
             elif name in self._used:
-                found, written, theirs = (
-                    self._statistics[name],
-                    self._units[name],
-                    reader.names[name],
-                )
+                found, written = self._statistics[name], self._units[name]
+                theirs = reader.names[name]
                 ends = np.array([found.low, found.high])
                 low, high = np.sort(convert(info.signal, written, ends))
                 sources.append(
@@ -356,7 +324,7 @@ class TableImport:
                         info.topic, theirs, written, unit, float(low), float(high),
                         found.missing, False, dict(reader.words[name].most_common(8)),
                         reader.empty[name], reader.grounds.get(name, ''),
-                        air_note(info.signal, written, theirs),
+                        plausibility.air_note(info.signal, written, theirs),
                     )
                 )  # fmt: skip
         return sources
@@ -442,11 +410,7 @@ class TableImport:
             if name in block.present:
                 spool.append(f'{name}?', block.present[name])
 
-    def _blocks(
-        self,
-    ) -> Iterator[
-        tuple[IntArray, slice | IntArray, dict[Signal, FloatArray], dict[Signal, ByteArray]]
-    ]:
+    def _blocks(self) -> Iterator[_Block]:
         """Yield times, row numbers in the file, columns and qualities, block by block."""
         spool = self._spool
         assert spool is not None
@@ -456,7 +420,7 @@ class TableImport:
             columns: dict[Signal, FloatArray] = {}
             quality: dict[Signal, ByteArray] = {}
             for name in self._used:
-                signal = _BY_COLUMN[name].signal
+                signal = _SIGNALS[name]
                 columns[signal] = convert(signal, self._units[name], spool.take(name, rows))
                 if f'{name}!' in spool:
                     quality[signal] = spool.take(f'{name}!', rows)
@@ -466,12 +430,12 @@ class TableImport:
         """Raise `RefusedError` for wrong guesses, and warn of other implausible columns."""
         settings, reader, steam = self._limits, self._reader, self._output == 'MW'
         judged = (
-            doubt(_BY_COLUMN[name].signal, found.sample(), self._units[name], settings, steam)
+            plausibility.doubt(_SIGNALS[name], found.sample(), self._units[name], settings, steam)
             for name, found in self._statistics.items()
         )
         doubts = [found for found in judged if found is not None]
-        guessed = {_BY_COLUMN[name].signal for name in reader.grounds}
-        names = {_BY_COLUMN[name].signal: theirs for name, theirs in reader.names.items()}
+        guessed = {_SIGNALS[name] for name in reader.grounds}
+        names = {_SIGNALS[name]: theirs for name, theirs in reader.names.items()}
         said = {c.name for c in self._mapping.columns.values() if c.unit}
         unsaid = {signal for signal in names if SIGNALS[signal].topic not in said}
         for strict, grounds in ((False, guessed), (True, unsaid)):
@@ -479,7 +443,7 @@ class TableImport:
             if strict and not (self._strict or refused):
                 break
             try:
-                refuse_guesses(reader.path, doubts, grounds, names)
+                plausibility.refuse_guesses(reader.path, doubts, grounds, names)
             except RefusedError as error:
                 refused = [one for one in refused if not one.last] + [error]
         if refused:
@@ -487,7 +451,7 @@ class TableImport:
             for sentence in reader.understood():
                 self._progress.say(sentence)
             raise merge_refusals(reader.path, refused)
-        refuse_impossible(reader.path, doubts, names)
+        plausibility.refuse_impossible(reader.path, doubts, names)
         for found in doubts:
             self._progress.warn(found.advice(names[found.signal]))
 
@@ -516,9 +480,5 @@ def _merged(blocks: Iterable[Readings], further: list[Series]) -> Iterator[Readi
 
 
 def _in_order(parts: list[Readings]) -> Readings:
-    columns = [
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ('time_ns', 'signal', 'value', 'quality')
-    ]
-    order = np.argsort(columns[0], kind='stable')
-    return Readings(*(column[order] for column in columns))
+    whole = plausibility.joined(parts)
+    return plausibility.selected(whole, np.argsort(whole.time_ns, kind='stable'))

@@ -1,22 +1,127 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``valveflow info``, ``export`` and ``recover``."""
+"""``valveflow simulate``, ``info``, ``export``, ``recover``: logs made, looked at, converted."""
 
 from __future__ import annotations
 
+import json
 import struct
 
 import numpy as np
 import pytest
-from logged import rewritten
+from logged import rewritten, values
 from monitor_recording import FLOAT64, Monitor, cdr, diagnosis, recording
 
 from valveflow_ros.interface.logs import open_log as open_whole_log
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.settings import settings_for
 from valveflow_ros.logs import RecordingWriter, open_log, read_table
+from valveflow_ros.plant.effects import catalogue
+from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, SIGNALS, Signal
 from valveflow_ros.signals.align import align_whole
+
+SHORT = ['--days', '0.02', '--seed', '4']
+
+
+def test_every_kind_of_log_holds_the_same(run, tmp_path):
+    names = ['a.csv', 'a.parquet', 'a.mcap', 'bag']
+    for name in names:
+        ran = run('simulate', '-o', tmp_path / name, *SHORT).done()
+        assert name in ran.out
+    first = open_log(tmp_path / names[0]).readings
+    for name in names[1:]:
+        readings = open_log(tmp_path / name).readings
+        for info in SIGNALS:
+            mine, theirs = first.signal == info.signal, readings.signal == info.signal
+            assert np.array_equal(first.value[mine], readings.value[theirs]), (name, info.topic)
+            assert np.array_equal(first.time_ns[mine], readings.time_ns[theirs])
+    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
+
+
+def test_the_files_that_were_written_are_named(run, tmp_path):
+    log, beside, truth = (tmp_path / n for n in ('a.mcap', 'metadata.yaml', 'truth.json'))
+    ran = run('simulate', '-o', log, '--truth', truth, *SHORT)
+    assert ran.out.endswith(f'\nWrote {log}, {beside} and {truth}.\n')
+    assert set(tmp_path.iterdir()) == {log, beside, truth}
+    table = tmp_path / 'a.csv'
+    other = tmp_path / 'b.mcap'
+    assert f'Wrote {other}.' in run('simulate', '-o', other, *SHORT).out
+    # Nothing but the file.
+    assert run('simulate', '-o', table, *SHORT, '--quiet').out == f'Wrote {table}.\n'
+
+
+@pytest.mark.parametrize('unit', ['paper', 'choked'])
+def test_a_simulation_begins_when_it_is_told_to(run, tmp_path, unit):
+    """In UTC where no zone is named; nothing else changes."""
+    path, rows = tmp_path / 'a.csv', set()
+    words = ['simulate', '-o', path, *SHORT, '--unit', unit, '--overwrite', '--start']
+    for time, utc in (('2026-02-01',) * 2, ('2026-03-01T06:00+02:00', '2026-03-01T04:00')):
+        assert run(*words, time).status == 0
+        times = read_table(path).time_ns
+        rows.add(len(times))
+        assert np.datetime64(int(times[0]), 'ns') == np.datetime64(utc)
+    assert len(rows) == 1
+    for time, sentence in (
+        ('soon', "'soon' is no time such as 2026-01-31T06:00Z."),
+        ('1969-01-01', 'A simulation must lie between the years 1970 and 2262.'),
+        ('9999-01-01', 'A simulation must lie between the years 1970 and 2262.'),
+    ):
+        assert sentence in run(*words, time).refused(2)
+
+
+def test_truth_is_told_only_when_asked(run, tmp_path):
+    log, file = tmp_path / 't.mcap', tmp_path / 'truth.json'
+    words = ['simulate', '-o', log, *SHORT, '--effect', 'gain_drift:g=0.02', '--json']
+    data = run(*words, '--truth', file).json
+    truth = json.loads(file.read_text())
+    assert data == {'log': str(log), 'rows': 1728, **truth}
+    assert [p['slope'] for p in truth['pieces']] == UnitDescription().curve.slopes.tolist()
+    assert truth['effects'] == [{'name': 'gain_drift', 'parameters': {'g': 0.02}}]
+    assert truth['dynamics'][-1]['power_to'] is None
+    assert not open_log(log).attachments
+    assert b'gain_drift' not in log.read_bytes()
+
+
+def test_effects_are_listed_with_their_parameters(run):
+    ran = run('simulate', '--effects')
+    data = run('simulate', '--effects', '--json').json
+    assert set(data['effects']) == set(catalogue())
+    for name, effect in catalogue().items():
+        assert effect.summary in ran.out
+        assert set(data['effects'][name]['parameters']) == {p.name for p in effect.parameters}
+    data = run('simulate', '--effects', '--unit', 'choked', '--json').json
+    assert 'pressure_scale' in data['effects']
+    assert 'exponent' not in data['effects']
+
+
+def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
+    log = tmp_path / 'x.mcap'
+    log.touch()
+    assert run('simulate', '-o', log, *SHORT).status == 0, 'an empty file is no loss'
+    before = log.read_bytes()
+    assert 'add --overwrite' in run('simulate', '-o', log, *SHORT[:2]).refused()
+    assert log.read_bytes() == before
+    assert run('simulate', '-o', log, *SHORT[:2], '--overwrite').status == 0
+    assert log.read_bytes() != before
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / 'mine.txt').write_text('keep')
+    assert 'not empty' in run('simulate', '-o', bag, *SHORT).refused()
+
+
+def test_another_unit_and_recording_are_simulated_and_told(run, tmp_path):
+    words = ['simulate', '-o', tmp_path / 'a.csv', *SHORT, '--unit', 'choked', '--recording']
+    ran = run(
+        *words, 'minute', '--truth', tmp_path / 't.json', '--effect', 'area_step:t0_days=0'
+    ).done()
+    assert 'choked: flow p^m f(V)' in ran.out
+    assert 'recorded minute' in ran.out
+    truth = json.loads((tmp_path / 't.json').read_text())
+    assert truth['form'] == 'opening'
+    assert truth['effects'][0]['name'] == 'area_step'
+    assert len(read_table(tmp_path / 'a.csv').time_ns) == 28
+    assert 'no recording' in run(*words, 'hourly', '--overwrite').refused(2)
 
 
 def test_info_tells_what_is_there(run, logs):
@@ -54,57 +159,38 @@ def test_info_of_a_table_tells_gaps_and_values_that_will_be_rejected(run, logs, 
     assert data['readings']['main_steam_pressure']['impossible'] == 1
 
 
-def test_info_of_a_cut_off_recording_says_so(run, logs, tmp_path):
-    whole = (logs / 'plant.mcap').read_bytes()
-    (tmp_path / 'cut.mcap').write_bytes(whole[: len(whole) // 2])
-    ran = run('info', tmp_path / 'cut.mcap')
-    assert ran.status == 0
-    assert 'Warning: ' in ran.err
-
-
 def test_export_gives_the_values_back(run, logs, tmp_path):
+    source = read_table(logs / 'plant.csv')
     for name in ('a.csv', 'a.parquet'):
-        ran = run('export', logs / 'plant.mcap', '-o', tmp_path / name)
-        assert ran.status == 0, ran.err
-        written, source = read_table(tmp_path / name), read_table(logs / 'plant.csv')
+        data = run('export', logs / 'plant.mcap', '-o', tmp_path / name, '--json').json
+        written = read_table(tmp_path / name)
+        assert data['rows'] == len(source.time_ns)
         assert np.array_equal(written.time_ns, source.time_ns)
         for info in SIGNALS:
             assert np.array_equal(written.columns[info.column], source.columns[info.column])
-    data = run('export', logs / 'plant.csv', '-o', tmp_path / 'b.csv', '--json').json
-    assert data['rows'] == len(source.time_ns)
-
-
-def test_export_takes_a_step(run, logs, tmp_path):
-    words = ['export', logs / 'plant.csv', '-o', tmp_path / 'a.csv', '--set', 'sample_period=10']
-    assert run(*words).status == 0
-    written = read_table(tmp_path / 'a.csv')
-    assert set(np.diff(written.time_ns)) == {10_000_000_000}
-
-
-def test_export_does_not_replace_by_accident(run, logs, tmp_path):
+    # A table that is there is not replaced by accident.
     table = tmp_path / 'a.csv'
     table.write_text('mine')
-    assert '--overwrite' in run('export', logs / 'plant.csv', '-o', table).refused()
+    words = ['export', logs / 'plant.csv', '-o', table, '--set', 'sample_period=10']
+    assert '--overwrite' in run(*words).refused()
     assert table.read_text() == 'mine'
-    assert run('export', logs / 'plant.csv', '-o', table, '--overwrite').status == 0
-    assert [p.name for p in tmp_path.iterdir()] == ['a.csv']
+    assert run(*words, '--overwrite').status == 0
+    assert set(np.diff(read_table(table).time_ns)) == {10_000_000_000}
 
 
 def test_recover_makes_a_whole_file_of_half_of_one(run, logs, tmp_path):
     whole = (logs / 'plant.mcap').read_bytes()
     broken = tmp_path / 'cut.mcap'
     broken.write_bytes(whole[: len(whole) // 2])
+    assert 'Warning: ' in run('info', broken).err
     data = run('recover', broken, '-o', tmp_path / 'b.mcap', '--json').json
-    ran = run('recover', broken, '-o', tmp_path / 'c.mcap')
-    assert ran.status == 0
-    assert 'Kept ' in ran.out
+    assert 'Kept ' in run('recover', broken, '-o', tmp_path / 'c.mcap').out
     after = open_log(tmp_path / 'b.mcap')
     assert not after.warnings
     assert len(after.readings) == data['messages'] > 1000
     assert broken.read_bytes() == whole[: len(whole) // 2]
-    values = open_log(logs / 'plant.mcap').readings
-    mine = after.readings.value[after.readings.signal == Signal.GENERATED_POWER]
-    theirs = values.value[values.signal == Signal.GENERATED_POWER]
+    mine = values(tmp_path / 'b.mcap', Signal.GENERATED_POWER)
+    theirs = values(logs / 'plant.mcap', Signal.GENERATED_POWER)
     assert np.array_equal(mine, theirs[: len(mine)])
     assert 'exists already' in run('recover', broken, '-o', tmp_path / 'b.mcap').refused()
 
