@@ -13,6 +13,7 @@ import numpy as np
 from valveflow_ros.errors import InputError
 from valveflow_ros.numerics import kernel
 from valveflow_ros.plant.thermal_unit import assignments
+from valveflow_ros.plant.unit import refuse_unless
 from valveflow_ros.records import NS_PER_S, BoolArray, FloatArray, IntArray
 
 RECORDINGS = ('1s', 'minute', 'compressed')
@@ -35,61 +36,41 @@ _OPTIONS = (
 class Historian:
     """How signals are recorded.
 
-    Attributes
-    ----------
-    recording : str
-        '1s': every sample. 'minute': the mean of each full minute of the record, stamped at
-        its end. 'compressed': a value is stored if a scan finds that it differs by more than
-        the dead band from the last stored one, or that the last one is too old.
-    band_percent : float
-        Dead band, % of the span in `SPANS`.
-    scan_low_s, scan_high_s : float
-        Each signal has its own scan interval in whole seconds, random between these limits.
-    longest_s : float
-        Maximum time between stored values; it is rounded down to a scan.
-    resample_s : float
-        For a compressed record: 0 gives each value at its own time; otherwise the step in whole
-        seconds of rows with the last stored values, from the time when all signals have one.
-    dropouts_per_day, dropout_minutes : float
-        Number of dropouts of a signal per day, and their mean duration.
+    ``recording`` '1s': every sample. 'minute': the mean of each full minute of the record, stamped
+    at its end. 'compressed': a value is stored if a scan finds that it differs by more than the
+    dead band from the last stored one, or that the last one is too old.
     """
 
     recording: str = '1s'
-    band_percent: float = 0.5
+    band_percent: float = 0.5  # dead band, % of the span in `SPANS`
+    # Each signal has its own scan interval in whole seconds, random between these limits.
     scan_low_s: float = 5.0
     scan_high_s: float = 30.0
-    longest_s: float = 600.0
+    longest_s: float = 600.0  # between stored values; it is rounded down to a scan
+    # Of a compressed record: 0 gives each value at its own time; otherwise the step in whole
+    # seconds of rows with the last stored values, from the time when all signals have one.
     resample_s: float = 0.0
-    dropouts_per_day: float = 0.0
-    dropout_minutes: float = 30.0
+    dropouts_per_day: float = 0.0  # of each signal
+    dropout_minutes: float = 30.0  # their mean duration
 
     def __post_init__(self) -> None:
-        """Check the options."""
         if self.recording not in RECORDINGS:
             raise InputError(
                 f"There is no recording '{self.recording}': use one of {', '.join(RECORDINGS)}."
             )
         checks = (
             (0.0 <= self.band_percent <= 50.0, 'band_percent must be 0 to 50 %'),
-            (
-                1.0 <= self.scan_low_s <= self.scan_high_s <= 600.0,
-                'scans must be 1 to 600 s and the shortest not above the longest',
-            ),
+            (1.0 <= self.scan_low_s <= self.scan_high_s <= 600.0,
+             'scans must be 1 to 600 s and the shortest not above the longest'),
             (self.longest_s >= self.scan_high_s, 'longest_s must not be below scan_high_s'),
-            (
-                0.0 <= self.resample_s <= 3600.0 and self.resample_s == self.resample_s // 1,
-                'resample_s must be whole seconds, 0 to 3600',
-            ),
-            (
-                self.resample_s == 0.0 or self.recording == 'compressed',
-                "resample_s belongs to the recording 'compressed'",
-            ),
+            (0.0 <= self.resample_s <= 3600.0 and self.resample_s == self.resample_s // 1,
+             'resample_s must be whole seconds, 0 to 3600'),
+            (self.resample_s == 0.0 or self.recording == 'compressed',
+             "resample_s belongs to the recording 'compressed'"),
             (0.0 <= self.dropouts_per_day <= 100.0, 'dropouts_per_day must be 0 to 100'),
             (0.0 < self.dropout_minutes <= 10_000.0, 'dropout_minutes: above 0, at most 10000'),
-        )
-        for good, sentence in checks:
-            if not good:
-                raise InputError(f'This recording cannot be made: {sentence}.')
+        )  # fmt: skip
+        refuse_unless('recording cannot be made', *checks)
 
     @classmethod
     def parse(cls, text: str) -> Historian:
@@ -138,23 +119,18 @@ class Historian:
         elif self.recording == 'minute':
             seconds, columns = _minutes(there)
         else:
-            kept = {
-                name: exceptions(
-                    column, *scans[name], self._band(name), round(self.longest_s)
-                )
-                for name, column in there.items()
-            }  # fmt: skip
+            kept = {}
+            for name, column in there.items():
+                band = self.band_percent / 100.0 * SPANS.get(name, 100.0)
+                kept[name] = exceptions(column, *scans[name], band, round(self.longest_s))
             seconds, columns = self._rows(there, kept)
         return start_ns + seconds * NS_PER_S, columns
-
-    def _band(self, name: str) -> float:
-        return self.band_percent / 100.0 * SPANS.get(name, 100.0)
 
     def _there(
         self, signals: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> dict[str, FloatArray]:
         """Return the signals with NaN in dropouts."""
-        n, out = _length(signals), {}
+        n, out, pause_s = _length(signals), {}, 86_400.0 / max(self.dropouts_per_day, 1e-9)
         for name, column in signals.items():
             # Each signal has its own generator: dropouts of one do not change those of another.
             mine = np.random.default_rng(rng.integers(2**63))
@@ -162,11 +138,11 @@ class Historian:
             if self.dropouts_per_day == 0.0:
                 continue
             out[name] = column.copy()
-            now = mine.exponential(86_400.0 / self.dropouts_per_day)
+            now = mine.exponential(pause_s)
             while now < n:
                 end = now + mine.exponential(60.0 * self.dropout_minutes)
                 out[name][int(now) : int(end) + 1] = np.nan
-                now = end + mine.exponential(86_400.0 / self.dropouts_per_day)
+                now = end + mine.exponential(pause_s)
         return out
 
     def _scans(

@@ -291,9 +291,11 @@ class Plant:
         self._clock_s = clock_s
         self._loop = ClosedLoop(hooks, drive.manual)
         self._disturbance = Disturbance(hooks.unit, seed)
-        self._opening = generator(seed, ChanceSource.OPENING_SENSOR)
-        self._pressure = generator(seed, ChanceSource.PRESSURE_SENSOR)
-        self._temperature = generator(seed, ChanceSource.TEMPERATURE_SENSOR)
+        self._sensors = [
+            generator(seed, source)
+            for source in (ChanceSource.OPENING_SENSOR, ChanceSource.PRESSURE_SENSOR,
+                           ChanceSource.TEMPERATURE_SENSOR)
+        ]  # fmt: skip
 
     def advance(self, count: int) -> PlantRows:
         """Return the next ``count`` rows."""
@@ -301,41 +303,22 @@ class Plant:
         outside = self._drive.advance(self._row - self._first_row, count)
         time_s = np.arange(self._row, self._row + count, dtype=np.float64) * unit.sample_period_s
         self._row += count
-        forcing = LoopInputs(
-            time_s,
-            np.mod(self._clock_s + time_s, DAY_S),
-            outside.pressure_mpa,
+        forcing = LoopInputs.forced(
+            hooks, time_s, np.mod(self._clock_s + time_s, DAY_S), outside.pressure_mpa,
             outside.temperature_degc,
-            np.ones(count),
-            np.ones(count),
-            np.zeros(count),
-        )
-        for change in hooks.forcing:
-            change(forcing)
+        )  # fmt: skip
         noise_mw = self._disturbance.advance(outside.load_mw)
-        motion = self._loop.advance(
-            Series(
-                time_s,
-                outside.load_mw,
-                outside.pressure_mpa,
-                outside.pressure_mpa**unit.pressure_exponent,
-                outside.moves_percent,
-                noise_mw,
-                forcing.gain,
-                forcing.input_gain,
-                forcing.offset_mw,
-            )
+        motion = self._loop.advance(Series(
+            time_s, outside.load_mw, outside.pressure_mpa,
+            outside.pressure_mpa**unit.pressure_exponent, outside.moves_percent, noise_mw,
+            forcing.gain, forcing.input_gain, forcing.offset_mw,
+        ))  # fmt: skip
+        shown = (motion.sensor, outside.pressure_mpa, outside.temperature_degc)
+        sizes = (unit.noise.opening_percent, unit.noise.pressure_mpa, unit.noise.temperature_k)
+        read = (
+            column + size * sensor.standard_normal(count)
+            for column, size, sensor in zip(shown, sizes, self._sensors, strict=True)
         )
-        sensors = unit.noise
         return PlantRows(
-            motion.command,
-            motion.sensor + sensors.opening_percent * self._opening.standard_normal(count),
-            outside.pressure_mpa + sensors.pressure_mpa * self._pressure.standard_normal(count),
-            outside.temperature_degc
-            + sensors.temperature_k * self._temperature.standard_normal(count),
-            motion.power,
-            noise_mw,
-            outside.load_mw,
-            motion.plug,
-            motion.u,
+            motion.command, *read, motion.power, noise_mw, outside.load_mw, motion.plug, motion.u
         )

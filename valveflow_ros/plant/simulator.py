@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,60 +30,34 @@ DECIMALS = {
 
 @dataclass(frozen=True, slots=True)
 class SimulatedLog:
-    """The record of the instruments, and the true values.
+    """The record of the instruments, and the true values; float64 (n,) each.
 
     If the power is stamped early or late (`clock`), its true value and its
     noise are in the rows of the stamps. So without faults of the record, the
     power in the table is ``true_power_mw + noise_mw``, rounded.
-
-    Attributes
-    ----------
-    table : SampleTable
-        Opening, pressure, temperature, power and command, rounded as in a historian.
-        The command is the output of the controller, before the actuator.
-    true_u : float64 (n,)
-        The true integrated input of the curve, % MPa^m.
-    true_power_mw : float64 (n,)
-        Power without noise.
-    load_mw : float64 (n,)
-        The load set point.
-    unit : UnitDescription
-        The unit that was simulated, without its effects.
-    noise_mw : float64 (n,)
-        The random disturbance of the power.
-    plug_percent : float64 (n,)
-        The true position of the plug.
-    active : tuple of EffectSpec
-        The effects switched on, with the values of all parameters.
     """
 
+    # Opening, pressure, temperature, power and command, rounded as in a historian; the
+    # command is the output of the controller, before the actuator.
     table: SampleTable
-    true_u: FloatArray
-    true_power_mw: FloatArray
-    load_mw: FloatArray
-    unit: UnitDescription
+    true_u: FloatArray  # integrated input of the curve, % MPa^m
+    true_power_mw: FloatArray  # without noise
+    load_mw: FloatArray  # the set point
+    unit: UnitDescription  # without its effects
     noise_mw: FloatArray
-    plug_percent: FloatArray
+    plug_percent: FloatArray  # the true position
     active: tuple[EffectSpec, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return len(self.table)
 
     @classmethod
     def joined(cls, parts: list[SimulatedLog]) -> SimulatedLog:
         """Join the parts of one run."""
-        first = parts[0]
-        return cls(
-            SampleTable.concatenate([part.table for part in parts]),
-            np.concatenate([part.true_u for part in parts]),
-            np.concatenate([part.true_power_mw for part in parts]),
-            np.concatenate([part.load_mw for part in parts]),
-            first.unit,
-            np.concatenate([part.noise_mw for part in parts]),
-            np.concatenate([part.plug_percent for part in parts]),
-            first.active,
-        )
+        names = ('true_u', 'true_power_mw', 'load_mw', 'noise_mw', 'plug_percent')
+        columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        table = SampleTable.concatenate([part.table for part in parts])
+        return replace(parts[0], table=table, **columns)
 
 
 class Recorder:
@@ -139,8 +113,6 @@ class Recorder:
         later = column[first + 1 : first + 1 + count]
         return column[first : first + count] * (1.0 - part) + later * part
 
-
-__all__ = ['DEFAULT_START_NS', 'WARM_UP_S', 'SimulatedLog', 'simulate', 'simulate_parts']
 
 WARM_UP_S = 3600.0
 LONGEST_DAYS = 400.0

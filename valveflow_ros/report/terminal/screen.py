@@ -49,14 +49,8 @@ _WHOLE = 100  # maximum lines of a sentence printed in full
 class Canvas:
     """A rectangle of characters for lines and marks.
 
-    Parameters
-    ----------
-    width, height : int
-        In characters, at least 1 each.
-    low, high : tuple of float
-        The lower left and the upper right corner, in data units.
-    unicode : bool
-        True if braille characters may be used; otherwise a dot is an asterisk.
+    ``low`` and ``high`` are its lower left and its upper right corner, in data units. With
+    ``unicode`` a dot is one of eight of a braille character, otherwise an asterisk.
     """
 
     def __init__(
@@ -109,10 +103,8 @@ class Canvas:
 
     def rows(self) -> list[str]:
         """Return the lines of characters from top to bottom, each as long as the width."""
-        return [
-            ''.join(self._character(row, column) for column in range(self.width))
-            for row in range(self.height)
-        ]
+        across = range(self.width)
+        return [''.join(self._character(row, k) for k in across) for row in range(self.height)]
 
     def _put(self, across: int, down: int) -> None:
         column, row = across // DOTS_X, down // DOTS_Y
@@ -132,19 +124,9 @@ def screen(
     frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True,
     zone: tzinfo | None = None, whole: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Return a frame as the lines for a terminal.
+    """Return a frame as the lines for a terminal, never more or longer than its size.
 
-    Parameters
-    ----------
-    frame : Frame
-    width, height : int
-        Size of the terminal; the lines are never more or longer than it.
-    colour, unicode : bool
-        Capabilities of the terminal.
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
-    whole : bool
-        Print every sentence in full, in as many additional lines as needed.
+    With ``whole`` every sentence is printed in full, in as many additional lines as needed.
     """
     lines = _lines(frame, max(20, width), max(5, height), unicode, zone, whole)
     shown = lines if whole else lines[: max(1, height)]
@@ -304,21 +286,13 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
 class Screen:
     """Show frames: in place on a terminal, otherwise as one line per change.
 
-    Parameters
-    ----------
-    out : text stream
-    environment : mapping, optional
-        Source of ``TERM`` and ``NO_COLOR``; the process environment by default.
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
+    ``environment`` has ``TERM`` and ``NO_COLOR``; by default it is that of the process.
     """
 
     def __init__(
-        self,
-        out: TextIO,
-        environment: Mapping[str, str] | None = None,
+        self, out: TextIO, environment: Mapping[str, str] | None = None,
         zone: tzinfo | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         known = os.environ if environment is None else environment
         self._out, self._zone = out, zone
         terminal = out.isatty()
@@ -338,11 +312,9 @@ class Screen:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
+        self, kind: type[BaseException] | None, error: BaseException | None,
         trace: TracebackType | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Restore the terminal."""
         if self._entered:
             with suppress(OSError):

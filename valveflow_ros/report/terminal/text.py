@@ -92,24 +92,12 @@ def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
 def number(
     wanted: str, low: float, high: float, example: str, *, above: bool = False
 ) -> Callable[[str], float]:
-    """Return a parser of numbers for ``type=`` of an option.
+    """Return a parser of finite numbers from ``low`` to ``high`` for ``type=`` of an option.
 
-    Parameters
-    ----------
-    wanted : str
-        Description with unit: 'a number of days'.
-    low, high : float
-        The range; if both ends are infinite, any finite number is allowed.
-    example : str
-        A correct example: '--days 10'.
-    above : bool
-        True if ``low`` itself is not allowed.
-
-    Returns
-    -------
-    callable
-        It raises `ArgumentTypeError` with a text that follows the name of the option: 'must be a
-        number of days above 0 and at most 400, such as --days 10; 'ten' is no number'.
+    With ``above``, ``low`` itself is not allowed. The parser raises `ArgumentTypeError` with a
+    text that follows the name of the option: 'must be a number of days above 0 and at most 400, such
+    as --days 10; 'ten' is no number', where ``wanted`` is 'a number of days' and ``example``
+    '--days 10'.
     """
     # No powers of ten: 1000000 is easier to read than 1e+06.
     first, last = f'{low:.15g}', f'{high:.15g}'
