@@ -77,8 +77,7 @@ def test_the_answer_comes_first_with_its_numbers(report):
 
 
 @pytest.mark.parametrize(
-    'form',
-    [{}, {'axis': OPENING, 'pressure_exponent': 0.0, 'pressure_scale_exponent': 1.1}],
+    'form', [{}, {'axis': OPENING, 'pressure_exponent': 0.0, 'pressure_scale_exponent': 1.1}]
 )
 def test_gain_by_load_is_the_slope_of_the_power_over_the_opening(identified, form):
     data = identified

@@ -110,6 +110,10 @@ class Hooks:
         """Multiply x = F(u) by a factor in each row."""
         self.forcing.append(lambda rows: np.multiply(rows.gain, factor(rows), out=rows.gain))
 
+    def add_power(self, part: Callable[[LoopInputs], FloatArray]) -> None:
+        """Add MW to the power in each row."""
+        self.forcing.append(lambda rows: np.add(rows.offset_mw, part(rows), out=rows.offset_mw))
+
     def scale_input(self, factor: Callable[[LoopInputs], FloatArray]) -> None:
         """Multiply u by a factor in each row."""
         self.forcing.append(
@@ -171,7 +175,6 @@ class Values:
 
 
 def _starts(values: Values) -> float:
-    """Return the onset of an effect that has one, in days."""
     return float(dict(values.pairs).get('t0_days', 0.0))
 
 

@@ -129,7 +129,6 @@ class Historian:
     def _there(
         self, signals: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> dict[str, FloatArray]:
-        """Return the signals with NaN in dropouts."""
         n, out, pause_s = _length(signals), {}, 86_400.0 / max(self.dropouts_per_day, 1e-9)
         for name, column in signals.items():
             # Each signal has its own generator: dropouts of one do not change those of another.
@@ -187,7 +186,6 @@ def _length(signals: Mapping[str, FloatArray]) -> int:
 
 
 def _minutes(signals: dict[str, FloatArray]) -> tuple[IntArray, dict[str, FloatArray]]:
-    """Return the means of the values in full minutes, stamped at the end of each minute."""
     count = _length(signals) // _MINUTE
     columns = {}
     for name, column in signals.items():

@@ -259,7 +259,6 @@ class Memory(NamedTuple):
 def _command(
     load: float, move: float, density: float, correction: float, flow: FlowLaw, manual: float
 ) -> float:
-    """Return the opening that the controller commands, in %."""
     wanted = move
     if manual == 0.0:
         u = interpolate(load, flow.curve_x, flow.curve_u) + correction
@@ -269,7 +268,6 @@ def _command(
 
 @jit
 def _corrected(correction: float, load: float, error: float, control: FloatArray) -> float:
-    """Integrate the error of the power control in MW to a correction of u."""
     if control[0] == 0.0:
         return correction
     if load < control[2]:
@@ -341,7 +339,6 @@ class ClosedLoop:
         return Motion(*out)
 
     def _begin(self, series: Series) -> Memory:
-        """Return the steady state of a plant at the first load."""
         load = float(series.load[0])
         self._past = np.full(self._depth, load)
         opening = _command(

@@ -104,7 +104,6 @@ class Recorder:
         return SimulatedLog(table, rows.u, power, rows.load, unit, noise, rows.plug, self._active)
 
     def _stamped(self, column: FloatArray, count: int) -> FloatArray:
-        """Return the values with the stamps of the rows, by linear interpolation."""
         whole = math.floor(self._shift)
         part = self._shift - whole
         first = self.behind + whole

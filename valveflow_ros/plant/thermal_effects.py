@@ -14,15 +14,7 @@ from dataclasses import dataclass, field
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import (
-    ONSET,
-    Effect,
-    Hooks,
-    Values,
-    effect,
-    ramp,
-    step,
-)
+from valveflow_ros.plant.effect import ONSET, Effect, Hooks, Values, effect, ramp, step
 from valveflow_ros.plant.effects import catalogue
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription
@@ -54,7 +46,6 @@ class ThermalHooks(Hooks):
 
 
 def _thermal(hooks: Hooks) -> ThermalHooks:
-    """Return the hooks as those of a thermal unit."""
     if not isinstance(hooks, ThermalHooks):
         raise InputError('This effect acts on a thermal unit only; choose one with unit=...')
     return hooks

@@ -245,7 +245,6 @@ class _Outside:
 def _set_point(
     unit: ThermalUnit, rng: np.random.Generator, time_s: FloatArray, clock_s: float
 ) -> FloatArray:
-    """Return schedule and AGC after the rate limit, MW (n,)."""
     low, span = unit.load_low_mw, unit.load_high_mw - unit.load_low_mw
     per_s = unit.ramp_mw_per_min / 60.0
     hour = np.mod(clock_s + time_s[0], DAY_S) / 3600.0
@@ -314,7 +313,6 @@ def _temperature(unit: ThermalUnit, rng: np.random.Generator, demand: FloatArray
 
 @kernel
 def _rate_limited(target: FloatArray, per_row: float) -> FloatArray:
-    """Follow a target by at most ``per_row`` per row."""
     out = np.empty_like(target)
     now = target[0]
     for t in range(target.size):
@@ -344,7 +342,6 @@ def _instruments(
     unit: ThermalUnit, hooks: ThermalHooks, outside: _Outside, truth: TrueRows,
     rng: np.random.Generator, rows: int,
 ) -> dict[str, FloatArray]:  # fmt: skip
-    """Return the measured values of every second, by column, float64 (rows,)."""
     kept = slice(_WARM_UP_S, _WARM_UP_S + rows)
     n, noise = truth.power.size, unit.noise
     series = outside.series

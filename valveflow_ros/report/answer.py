@@ -60,7 +60,6 @@ def doubt(data: Identified) -> str:
 
 
 def _no_effect(data: Identified) -> str:
-    """Return a warning if the power follows the pressure and hardly the opening; else empty."""
     gains = gain_by_load(data)
     if not gains:
         return ''
@@ -102,9 +101,8 @@ def form_words(c: Characteristic) -> str:
         return ''
     return (
         f'The breakpoints of this valve are at fixed openings: the power follows {mine}. On '
-        'held-out data the error of this form is '
-        f'{say.plain(form.rmse_mw, 2)} MW, that of {form.other} '
-        f'{say.plain(form.rmse_other_mw, 2)} MW.'
+        f'held-out data the error of this form is {say.plain(form.rmse_mw, 2)} MW, that of '
+        f'{form.other} {say.plain(form.rmse_other_mw, 2)} MW.'
     )
 
 
@@ -195,8 +193,7 @@ def answer_words(data: Identified) -> str:
         f'{say.counted(c.source.steady, "steady-state segment")} and '
         f'{say.counted(c.source.slope_response, "slope-response segment")} '
         f'({say.counted(c.source.samples, "sample")}). The typical difference between curve and '
-        'samples is '
-        f'{say.plain(c.residuals.rmse_mw, 2)} MW. {pieces_doubt(c)}'
+        f'samples is {say.plain(c.residuals.rmse_mw, 2)} MW. {pieces_doubt(c)}'
     )
     told = [html.text(doubt(data))]
     if c.source.temperature_flag:
@@ -209,9 +206,8 @@ def answer_words(data: Identified) -> str:
         )
     if any(p.slope <= 0.0 for p in c.pieces):
         told.append(
-            'On one piece the power does not rise with u, so the curve has no inverse there '
-            'and cannot be '
-            'compensated. A flat upper end is normal; a falling piece elsewhere is not.'
+            'On one piece the power does not rise with u, so the curve has no inverse there and '
+            'cannot be compensated. A flat upper end is normal; a falling piece elsewhere is not.'
         )
     told += [html.text(n) for n in (say.held_words(c.held), *c.notes)]
     form = form_words(data.characteristic)
@@ -220,7 +216,6 @@ def answer_words(data: Identified) -> str:
 
 
 def _bends(c: Characteristic) -> str:
-    """Return what the shape of the curve means for control."""
     if len(c.pieces) == 1:
         return ' It is straight.'
     steep = max(c.pieces, key=lambda p: p.slope)
@@ -256,7 +251,6 @@ def pieces_table(data: Identified) -> str:
 
 
 def _rests(c: Characteristic, k: int) -> list[str]:
-    """Return the data behind a piece, as a cell of the table; empty list if unknown."""
     if not c.support:
         return []
     found = c.support[k]
@@ -365,7 +359,7 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
 
 _KEPT = {
     'prediction_error': 'the number kept is the one that predicts all samples best once the '
-    'dynamics are known',
+    'dynamics are known'
 }
 _LEAST_SHOWN = 0.005  # smaller probabilities of a number of pieces are not listed
 _DOUBTFUL = 0.05  # probability of another number of pieces that makes the chosen one uncertain

@@ -120,7 +120,6 @@ def _of(terms: Terms, pairs: tuple[Pair, ...]) -> list[Pair]:
 
 
 def _headline(pairs: tuple[Pair, ...]) -> str:
-    """Return who predicts better, on equal terms and on the largest data set."""
     terms = next(t for t in _ABOUT if _of(t, pairs))
     parts = [
         f'{words} {" and ".join(names)}'
@@ -131,7 +130,6 @@ def _headline(pairs: tuple[Pair, ...]) -> str:
 
 
 def _against(pairs: list[Pair]) -> str:
-    """Return the error of each other method, and the result of the test over segments."""
     told = []
     for p in pairs:
         mse = p.mse_theirs_mw2
@@ -216,7 +214,6 @@ def comparison_page(data: Compared) -> Page:
 
 
 def _linear_block_words(data: Compared) -> str:
-    """Return the linear block of the Hammerstein model in words."""
     m = data.result.hammerstein.model
     times = ', '.join(f'{say.plain(float(t), 3)} s' for t in m.time_constants_s)
     return (
@@ -280,7 +277,6 @@ LOOK = {
 
 
 def _method_line(method: str, x: Any, y: Any, hover: str, **more: Any) -> Spec:
-    """Return a line in the style of a method."""
     colour, dash, width = LOOK[method]
     # A legend has little space.
     name = "the paper's curve" if method == 'paper' else LABELS[method]
@@ -392,7 +388,6 @@ def stretches(data: Compared) -> list[Stretch]:
 
 
 def _means(values: FloatArray, first: int, end: int) -> FloatArray:
-    """Return means over short blocks, to limit the number of points."""
     block = max(1, (end - first) // _POINTS)
     usable = (end - first) // block * block
     with np.errstate(invalid='ignore'):
@@ -402,7 +397,6 @@ def _means(values: FloatArray, first: int, end: int) -> FloatArray:
 def _over_time(
     data: Compared, values: FloatArray, first: int, end: int
 ) -> tuple[list[float | None], list[float | None], str]:
-    """Return times, means of a power, and the hover text for both."""
     at = plot.rounded(_means(data.result.trial.time_ns[first:end] / 1e6, 0, end - first), 14)
     known = np.where(np.isfinite(values), values, np.nan)
     return at, plot.rounded(_means(known, first, end)), '%{x|%d %b %H:%M:%S}<br>%{y:.1f} MW'

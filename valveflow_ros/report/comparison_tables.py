@@ -76,7 +76,6 @@ def mse_cell(value: float) -> str:
 
 
 def _pieces(data: Compared) -> Iterator[tuple[str, int, Line]]:
-    """Yield each piece of each curve with pieces: method, index of the piece, curve."""
     for method in METHODS:
         if (line := data.result.lines.get(method)) is not None:
             for j in range(len(line.slopes)):

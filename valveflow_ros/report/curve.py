@@ -128,9 +128,8 @@ def _caption(data: Identified) -> str:
     if data.at_pressure:
         parts.append(
             'The breakpoints of this valve are at fixed openings; the power is '
-            f'shown{data.at_pressure}, at '
-            'other pressures p the part without the constant c is proportional to p^'
-            f'{data.characteristic.pressure_scale_exponent:.3g}.'
+            f'shown{data.at_pressure}, at other pressures p the part without the constant c is '
+            f'proportional to p^{data.characteristic.pressure_scale_exponent:.3g}.'
         )
     if len(c.pieces) > 1:
         parts.append(
@@ -160,7 +159,6 @@ def _line(
     pieces: tuple[Piece, ...], name: str, colour: str, width: float, dash: str = '',
     hover: str = 'u %{x:.4~g}<br>%{y:.4~g} MW',
 ) -> Spec:  # fmt: skip
-    """Return the lines of all pieces, separated by gaps."""
     x = [v for p in pieces for v in (p.u_from, p.u_to, math.nan)]
     y = [
         v for p in pieces
@@ -334,7 +332,6 @@ def _row(number: int, p: PieceShift) -> list[str]:
 
 
 def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
-    """Return the difference of each segment from the reference over time."""
     moved = np.zeros(len(found), dtype=bool)
     for p in shift.pieces:
         if p.moved:

@@ -159,8 +159,7 @@ def coverage_figure(data: Identified) -> Figure | None:
     share = say.percent(len(data.special) / len(known), 2)
     caption = (
         '<b>Every piece needs special segments.</b> How long the unit ran at each u; blue, the '
-        'part in '
-        f'special segments, {share} of all. Dotted, the breakpoints. Where there is '
+        f'part in special segments, {share} of all. Dotted, the breakpoints. Where there is '
         'little blue, more data at that load would make the curve more certain.'
     )
     words = (
@@ -279,7 +278,6 @@ def signals_figure(data: Identified) -> Figure:
 
 
 def _panel(data: Identified, values: FloatArray, up: str, unit: str) -> list[Spec]:
-    """Return the measured signal in grey and its special segments in colour."""
     time_ns = data.table.time_ns
     shown: Spec = {'yaxis': up, 'showlegend': up == 'y'}
     start_ns, step_ns, ends = plot.envelope(time_ns, values, _DRAWN_STRETCHES, data.period_ns)

@@ -74,7 +74,6 @@ def _drifts(d: Diagnosis) -> bool:
 
 
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
-    """Return the verdict with its uncertainty, its effect, and the most informative figure."""
     d = data.diagnosis
     said = html.text(d.sentence)
     good = d.verdict == NOTHING and not _drifts(d)
@@ -195,8 +194,7 @@ def _proof(data: Diagnosed) -> Section:
         parts += [
             html.paragraph(
                 'What each cause gains there; p is the probability of such a gain by chance, '
-                'corrected for the '
-                'number of causes tried:'
+                'corrected for the number of causes tried:'
             ),
             html.table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], rows),
         ]
@@ -245,7 +243,6 @@ _MOST_SPANS = 20
 
 
 def _variable(name: str, exponent: float) -> str:
-    """Return the name of a variable in a sentence; the exponent is that of u."""
     return _of_opening(_VARIABLES[name][0], exponent) if name in _VARIABLES else name
 
 
@@ -303,7 +300,6 @@ _BOTH = (('simulation', 'raw', 'dash'), ('extended model', 'curve', 'solid'))
 
 
 def _moments(start_ns: int, time_s: FloatArray) -> list[float | None]:
-    """Return times since the first row in the format of a date axis."""
     return plot.moments(start_ns / 1e6 + 1e3 * np.asarray(time_s))
 
 
@@ -438,9 +434,8 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
     names = [_variable(name, data.exponent) for name in (m.across, m.up)]
     return Figure(
         f'map-{m.across.replace(" ", "-")}',
-        f'<b>Residual over {html.text(names[0])} and {html.text(names[1])}</b>, '
-        'simulation left, extended model right. Only cells outside the 99 % band of random noise '
-        'are filled: '
+        f'<b>Residual over {html.text(names[0])} and {html.text(names[1])}</b>, simulation left, '
+        'extended model right. Only cells outside the 99 % band of random noise are filled: '
         f'{m.shown_before} of {m.cells} for the simulation, {m.shown_after} for the extended '
         f'model; chance alone fills about {say.plain(0.01 * m.cells, 1)}.',
         f'{m.shown_before} of {m.cells} cells are outside it before, {m.shown_after} after.',

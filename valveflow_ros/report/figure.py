@@ -49,7 +49,6 @@ class Figure:
 
 
 def _clean(value: Any) -> Any:
-    """Convert numpy scalars to Python's, and values that are not finite to null."""
     if isinstance(value, Mapping):
         return {str(k): _clean(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -322,7 +321,6 @@ def _cell(value: Any, date: bool = False) -> str:
 
 
 def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
-    """Yield x, y, value, and the ends of the error bar of each point."""
     x, y = column(trace, 'x'), column(trace, 'y')
     if trace['type'] == 'heatmap':
         across = _centres(x, len(trace['z'][0]))
@@ -340,7 +338,6 @@ def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
 
 
 def _centres(places: list[Any], count: int) -> list[Any]:
-    """Return the centres of cells given by their edges."""
     if len(places) == count:
         return places
     return [0.5 * (a + b) for a, b in pairwise(places)]

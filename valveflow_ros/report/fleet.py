@@ -121,7 +121,6 @@ def _history(curves: Sequence[Row]) -> History:
 
 
 def _link(words: str, *parts: str) -> str:
-    """Return a link to a file next to the page; ``words`` are HTML."""
     return f'<a href="{"/".join(quote(p, safe="") for p in parts)}">{words}</a>'
 
 
@@ -272,6 +271,5 @@ def _log_cells(row: Row) -> list[str]:
 
 
 def _moved(row: Row, name: str) -> str:
-    """Return the largest change of a piece, in words."""
     low, high = row[f'{name}_u_from'], row[f'{name}_u_to']
     return f'{say.signed(row[f"{name}_mw"])} {row["output_unit"]} at u {low:.0f} to {high:.0f}'

@@ -221,12 +221,10 @@ def _names(history: History) -> list[str]:
 
 
 def _row_of(name: str) -> str:
-    """Return the name of an alarm for the figure and the table, as HTML."""
     return html.text(name.replace('_', ' '))
 
 
 def _broken(sentence: str) -> str:
-    """Split a sentence into lines for a hover text."""
     lines = ['']
     for word in html.text(sentence).split():
         if lines[-1] and len(lines[-1]) + len(word) >= _LINE:

@@ -22,12 +22,7 @@ from valveflow_ros.report.answer import (
     temperature_words,
     window_words,
 )
-from valveflow_ros.report.curve import (
-    curve_figure,
-    opening_figure,
-    segments_figure,
-    shift_section,
-)
+from valveflow_ros.report.curve import curve_figure, opening_figure, segments_figure, shift_section
 from valveflow_ros.report.data import (
     coverage_figure,
     presence_figure,
@@ -108,7 +103,6 @@ def _read(data: Identified) -> str:
 
 
 def _settings(settings: Settings) -> str:
-    """Return the parameters that differ from their default."""
     rows = [
         [
             html.text(name),

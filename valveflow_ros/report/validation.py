@@ -175,7 +175,6 @@ def _markers(v: Validation, by_time: bool) -> list[Spec]:
 
 
 def _layout(v: Validation, across: Spec) -> Spec:
-    """Return the layout of a figure of differences, with the tolerance as a band."""
     tolerance = {
         'type': 'rect', 'xref': 'paper', 'yref': 'y', 'x0': 0, 'x1': 1, 'layer': 'below',
         'y0': -v.tolerance_mw, 'y1': v.tolerance_mw, 'line': {'width': 0},

@@ -10,17 +10,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import (
+from valveflow_ros.plant.effect import (  # fmt: skip
     DAY_S,
     ONSET,
     Hooks,
-    LoopInputs,
     Values,
     effect,
     not_above,
     ramp,
     step,
-)  # fmt: skip
+)
 from valveflow_ros.records import FloatArray
 
 
@@ -97,11 +96,7 @@ def output_offset_drift(values: Values, hooks: Hooks) -> None:
 
         y = G x + b t / 10 d,  t from the first row on
     """
-
-    def change(rows: LoopInputs) -> None:
-        rows.offset_mw[:] += values['b_mw'] * ramp(rows.time_s)
-
-    hooks.forcing.append(change)
+    hooks.add_power(lambda rows: values['b_mw'] * ramp(rows.time_s))
 
 
 _HOUR_S = 3600.0

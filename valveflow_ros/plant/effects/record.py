@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import (
+from valveflow_ros.plant.effect import (  # fmt: skip
     DAY_S,
     ONSET,
     SIGNAL,
@@ -18,7 +18,7 @@ from valveflow_ros.plant.effect import (
     Hooks,
     Values,
     effect,
-)  # fmt: skip
+)
 from valveflow_ros.records import FloatArray
 
 

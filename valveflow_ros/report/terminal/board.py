@@ -200,7 +200,6 @@ def _age_ns(fit: Fields) -> int:
 
 
 def _item(status: Fields) -> HealthView:
-    """Return an item of the health, without the name of the monitor."""
     level = status['level']
     number = level[0] if isinstance(level, bytes) else int(level)
     return HealthView(_item_name(status), number, str(status['message']))

@@ -119,7 +119,6 @@ class Frame:
 
 
 def _word(words: tuple[str, ...], number: int) -> str:
-    """Return the word for a number of a message; unknown numbers are returned as text."""
     return words[number] if 0 <= number < len(words) else f'state {number}'
 
 

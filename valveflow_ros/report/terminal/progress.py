@@ -124,13 +124,11 @@ class Progress:
         self._shown = True
 
     def _gone(self, now: float) -> str:
-        """Return the elapsed time, or '' if it is very short."""
         assert self._begun_s is not None
         gone = now - self._begun_s
         return f'{in_words(gone)} so far  ' if gone >= _LEAST_S else ''
 
     def _left(self, now: float) -> str:
-        """Return the remaining time, or '' if unknown."""
         left = self._ends_s - now
         return f'about {in_words(left)} left  ' if math.isfinite(left) and left >= 0.5 else ''
 

@@ -16,18 +16,8 @@ from types import FrameType, TracebackType
 from typing import TextIO
 
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.terminal.frame import (
-    Frame,
-    SampleView,
-    alarm_words,
-    alarms_words,
-    curve_words,
-    diagnosis_words,
-    health_words,
-    inputs_words,
-    recorder_words,
-    sample_words,
-)
+from valveflow_ros.report.terminal import frame as views
+from valveflow_ros.report.terminal.frame import Frame, SampleView
 from valveflow_ros.report.terminal.text import Line, cells, clean, cut, labelled, painted
 from valveflow_ros.report.words import duration, in_zone, input_unit_plain, moment, signed
 
@@ -140,11 +130,11 @@ def _lines(
     head = [_title(frame, width, zone)]
     if frame.note:
         head += labelled('         ', in_zone(frame.note, zone), 'warn', width, most)
-    curve_text, tone = curve_words(frame.curve, frame.now_ns)
+    curve_text, tone = views.curve_words(frame.curve, frame.now_ns)
     head += labelled('Curve    ', in_zone(curve_text, zone), tone, width, most)
     text = _text(frame, width, _WHOLE if whole else 1, zone)
     height += len(text) if whole else 0
-    residual = list(labelled('Residual ', *sample_words(frame.last), width, 2))
+    residual = list(labelled('Residual ', *views.sample_words(frame.last), width, 2))
     left = height - len(head) - len(residual) - len(text)
     curve_rows, residual_rows = _shares(left, frame)
     spare = left - (curve_rows + 1 if curve_rows else 0) - residual_rows
@@ -184,13 +174,12 @@ def _title(frame: Frame, width: int, zone: tzinfo | None) -> Line:
 
 
 def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line]:
-    """Return alarms, inputs, recorder and diagnosis, each in at most ``most`` lines."""
     lines: list[Line] = []
     for label, told in (
-        ('Alarms   ', alarms_words(frame)),
-        ('Inputs   ', inputs_words(frame)),
-        ('Recorder ', [recorder_words(frame)]),
-        ('Diagnosis', [diagnosis_words(frame.diagnosis)]),
+        ('Alarms   ', views.alarms_words(frame)),
+        ('Inputs   ', views.inputs_words(frame)),
+        ('Recorder ', [views.recorder_words(frame)]),
+        ('Diagnosis', [views.diagnosis_words(frame.diagnosis)]),
     ):
         for k, (text, tone) in enumerate(told):
             before = label if k == 0 else ' ' * len(label)
@@ -199,7 +188,6 @@ def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line
 
 
 def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
-    """Return the curve with its breakpoints and the operating point, and its axis."""
     curve, last = frame.curve, frame.last
     pairs = zip(curve.breakpoints, curve.values, strict=False) if curve else ()
     points = [pair for pair in pairs if all(map(math.isfinite, pair))]
@@ -224,7 +212,6 @@ def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
 
 
 def _strip(samples: Sequence[SampleView], width: int, rows: int, unicode: bool) -> list[Line]:
-    """Return the last residuals over time with their limits."""
     known = [s for s in samples if math.isfinite(s.residual_mw)]
     if not known:
         return []
@@ -267,20 +254,20 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
         yield 'note', now.note
     if now.curve is not None and now.curve != before.curve:
         # The age of the curve is not a change.
-        yield 'curve', curve_words(now.curve, 0)[0]
+        yield 'curve', views.curve_words(now.curve, 0)[0]
     old = {alarm.name: alarm for alarm in before.alarms}
     for alarm in now.alarms:
         if old.get(alarm.name) != alarm:
-            yield 'alarm', alarm_words(alarm)[0]
+            yield 'alarm', views.alarm_words(alarm)[0]
     levels = {item.name: item.level for item in before.inputs}
     for item in now.inputs:
         if levels.get(item.name) != item.level:
-            yield 'input', health_words(item)[0]
+            yield 'input', views.health_words(item)[0]
     old_level = None if before.recorder is None else before.recorder.level
     if now.recorder is not None and now.recorder.level != old_level:
         yield 'recorder', now.recorder.sentence
     if now.diagnosis is not None and now.diagnosis != before.diagnosis:
-        yield 'diagnosis', diagnosis_words(now.diagnosis)[0]
+        yield 'diagnosis', views.diagnosis_words(now.diagnosis)[0]
 
 
 class Screen:

@@ -95,9 +95,8 @@ def number(
     """Return a parser of finite numbers from ``low`` to ``high`` for ``type=`` of an option.
 
     With ``above``, ``low`` itself is not allowed. The parser raises `ArgumentTypeError` with a
-    text that follows the name of the option: 'must be a number of days above 0 and at most 400, such
-    as --days 10; 'ten' is no number', where ``wanted`` is 'a number of days' and ``example``
-    '--days 10'.
+    text that follows the name of the option: 'must be a number of days above 0 and at most 400,
+    such as --days 10; 'ten' is no number', of ``wanted`` 'a number of days'.
     """
     # No powers of ten: 1000000 is easier to read than 1e+06.
     first, last = f'{low:.15g}', f'{high:.15g}'
