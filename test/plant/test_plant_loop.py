@@ -147,7 +147,7 @@ EVERYTHING = Faults(0.6, 1.0, 0.7, 0.12, 84.0, 0.0, 0.3, 20.0)
 EVERYTHING_SPECS = ('backlash', 'stiction', 'rate_limit', 'saturation', 'reheater')
 
 
-@pytest.mark.parametrize('number', [None, 0, 1, 3])
+@pytest.mark.parametrize('number', [None, 1, 3])
 @pytest.mark.parametrize('faulty', [False, True])
 def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None:
     rng = np.random.default_rng(number)
@@ -159,8 +159,8 @@ def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None
     faults = dataclasses.replace(EVERYTHING, kappa=kappa) if faulty else Faults()
     effects = [EffectSpec.parse(name) for name in EVERYTHING_SPECS] if faulty else []
     effects += [EffectSpec.of('choked', kappa=kappa)] if faulty else []
-    log = simulate(0.07, seed=5, unit=unit, effects=effects)
-    slow = naive_plant(unit, 0.07, 5, faults)
+    log = simulate(0.03, seed=5, unit=unit, effects=effects)
+    slow = naive_plant(unit, 0.03, 5, faults)
     np.testing.assert_allclose(log.table.values[:, 4], np.round(slow[:, 0], 2), atol=0.0101)
     np.testing.assert_allclose(log.plug_percent, slow[:, 1], rtol=1e-9)
     np.testing.assert_allclose(log.true_u, slow[:, 2], rtol=1e-9)
@@ -227,9 +227,9 @@ def test_a_sticking_valve_stays_or_jumps(path: list[float], band: float, share: 
     assert np.all(np.abs(position - path) <= (band + jump) / 2 + 1e-9)
 
 
-@given(paths, st.floats(0.01, 10.0), st.sampled_from([0.5, 2.0]), st.floats(1.0, 100.0))
+@given(paths, st.floats(0.1, 10.0), st.sampled_from([0.5, 2.0]), st.floats(1.0, 100.0))
 def test_rate_and_stop_are_kept(path: list[float], rate: float, step_s: float, top: float) -> None:
-    position = through([*path, *[50.0] * 20_000], step_s, rate_percent_per_s=rate)
+    position = through([*path, *[50.0] * 2_000], step_s, rate_percent_per_s=rate)
     assert np.all(np.abs(np.diff(position)) <= rate * step_s + 1e-9)
     assert position[-1] == 50.0, 'it ends where it is sent if it is given the time'
     np.testing.assert_array_equal(through(path, top_percent=top)[1:], np.minimum(path, top)[1:])

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from monitor_recording import stamp
 from report_stories import HOUR_NS, KNOTS, START_NS, STEP_MW, history
@@ -119,6 +119,7 @@ def test_what_has_no_time_is_no_part_of_the_story_and_a_shift_has_its_last_words
     ]  # fmt: skip
 
 
+@settings(max_examples=25)
 @given(st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3))
 def test_the_largest_move_is_that_of_the_last_curve_and_lies_at_a_knot(change):
     told = history()
@@ -146,6 +147,7 @@ def test_the_name_and_the_sentence_of_an_alarm_are_no_markup():
     assert words_of(told).count(name) == 1
 
 
+@settings(max_examples=40)
 @given(
     st.lists(
         st.tuples(st.integers(0, 99), st.sampled_from('ab'), st.sampled_from(AlarmState)),

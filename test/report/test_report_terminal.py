@@ -78,7 +78,7 @@ some_frames = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(some_frames, st.integers(1, 200), st.integers(1, 60), st.booleans(), st.booleans())
 def test_whatever_is_known_it_fits_and_nothing_of_others_commands_the_terminal(
     frame, width, height, colour, unicode

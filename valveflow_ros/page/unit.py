@@ -43,6 +43,12 @@ class Day:
         self._view: tuple[Minute, ...] = ()
         self._begin(-1)
 
+    def _begin(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._n = self._n_predicted = 0
+        self._sum = self._sum_predicted = 0.0
+        self._low, self._high = math.inf, -math.inf
+
     def add(self, sample: SampleView) -> None:
         """Add a sample; if the clock went back, the earlier ones are dropped."""
         start_ns = sample.time_ns - sample.time_ns % MINUTE_NS
@@ -69,12 +75,6 @@ class Day:
         if ends != ((self._view[0], self._view[-1]) if self._view else None):
             self._view = tuple(self._closed)
         return self._view
-
-    def _begin(self, start_ns: int) -> None:
-        self._start_ns = start_ns
-        self._n = self._n_predicted = 0
-        self._sum = self._sum_predicted = 0.0
-        self._low, self._high = math.inf, -math.inf
 
     def _close(self) -> None:
         known, nan = self._n_predicted, math.nan

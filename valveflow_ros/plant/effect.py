@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter, Value
@@ -39,13 +40,19 @@ class LoopInputs:
     offset_mw: FloatArray
 
     @classmethod
-    def forced(cls, hooks: Hooks, *outside: FloatArray) -> LoopInputs:
-        """Return the inputs from time to temperature with what the effects of a run do to them."""
-        n = outside[0].size
-        rows = cls(*outside, np.ones(n), np.ones(n), np.zeros(n))
+    def forced(
+        cls, hooks: Hooks, time_s: FloatArray, clock_s: FloatArray, pressure_mpa: FloatArray,
+        temperature_degc: FloatArray,
+    ) -> LoopInputs:  # fmt: skip
+        """Return the inputs from outside with what the effects of a run do to them."""
+        one, outside = np.ones(time_s.size), (time_s, clock_s, pressure_mpa, temperature_degc)
+        rows = cls(*outside, one, one.copy(), np.zeros(time_s.size))
         for change in hooks.forcing:
             change(rows)
         return rows
+
+
+Change = Callable[[LoopInputs], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +96,7 @@ class Hooks:
     unit: UnitDescription  # without any effect
     length_s: float  # of the recorded part
     regions: tuple[Region, ...]
-    forcing: list[Callable[[LoopInputs], None]] = field(default_factory=list)
+    forcing: list[Callable[[LoopInputs], object]] = field(default_factory=list)
     writing: list[Callable[[HistorianRows], None]] = field(default_factory=list)
     before_sensor: ActuatorLimits = field(default_factory=ActuatorLimits)
     after_sensor: ActuatorLimits = field(default_factory=ActuatorLimits)
@@ -106,15 +113,15 @@ class Hooks:
         """Return hooks without any effect."""
         return cls(unit, length_s, unit.regions)
 
-    def scale_power(self, factor: Callable[[LoopInputs], FloatArray]) -> None:
+    def scale_power(self, factor: Change) -> None:
         """Multiply x = F(u) by a factor in each row."""
         self.forcing.append(lambda rows: np.multiply(rows.gain, factor(rows), out=rows.gain))
 
-    def add_power(self, part: Callable[[LoopInputs], FloatArray]) -> None:
+    def add_power(self, part: Change) -> None:
         """Add MW to the power in each row."""
         self.forcing.append(lambda rows: np.add(rows.offset_mw, part(rows), out=rows.offset_mw))
 
-    def scale_input(self, factor: Callable[[LoopInputs], FloatArray]) -> None:
+    def scale_input(self, factor: Change) -> None:
         """Multiply u by a factor in each row."""
         self.forcing.append(
             lambda rows: np.multiply(rows.input_gain, factor(rows), out=rows.input_gain)

@@ -313,12 +313,11 @@ class Plant:
             outside.pressure_mpa**unit.pressure_exponent, outside.moves_percent, noise_mw,
             forcing.gain, forcing.input_gain, forcing.offset_mw,
         ))  # fmt: skip
-        shown = (motion.sensor, outside.pressure_mpa, outside.temperature_degc)
-        sizes = (unit.noise.opening_percent, unit.noise.pressure_mpa, unit.noise.temperature_k)
-        read = (
-            column + size * sensor.standard_normal(count)
-            for column, size, sensor in zip(shown, sizes, self._sensors, strict=True)
-        )
+        sizes = unit.noise
+        opening, pressure, temperature = (s.standard_normal(count) for s in self._sensors)
         return PlantRows(
-            motion.command, *read, motion.power, noise_mw, outside.load_mw, motion.plug, motion.u
-        )
+            motion.command, motion.sensor + sizes.opening_percent * opening,
+            outside.pressure_mpa + sizes.pressure_mpa * pressure,
+            outside.temperature_degc + sizes.temperature_k * temperature, motion.power, noise_mw,
+            outside.load_mw, motion.plug, motion.u,
+        )  # fmt: skip

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +56,9 @@ class SimulatedLog:
     def joined(cls, parts: list[SimulatedLog]) -> SimulatedLog:
         """Join the parts of one run."""
         names = ('true_u', 'true_power_mw', 'load_mw', 'noise_mw', 'plug_percent')
-        columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(p, name) for p in parts]) for name in names
+        }
         table = SampleTable.concatenate([part.table for part in parts])
         return replace(parts[0], table=table, **columns)
 

@@ -91,7 +91,7 @@ def curve_figure(data: Identified) -> Figure:
 def opening_figure(data: Identified) -> Figure | None:
     """Return the power over the opening at typical pressures; None if the pressure is unknown."""
     wanted = [Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]
-    opening, pressure = data.table.values[np.ix_(data.special, wanted)].T
+    opening, pressure = data.table.values[data.special][:, wanted].T
     known = np.isfinite(opening) & (pressure > 0.0)
     if not known.any():
         return None
