@@ -133,13 +133,7 @@ class Hooks:
         return self.before_sensor if before_sensor else self.after_sensor
 
     def claim(self, name: str, place: str = '') -> None:
-        """Reserve a place that can have one setting only.
-
-        Raises
-        ------
-        InputError
-            The place is already reserved.
-        """
+        """Reserve a place that can have one setting only; raises `InputError` if it is taken."""
         key = f'{name} {place}'
         if key in self._claimed:
             where = f' {place}' if place else ''

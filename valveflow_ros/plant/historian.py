@@ -74,13 +74,7 @@ class Historian:
 
     @classmethod
     def parse(cls, text: str) -> Historian:
-        """Read ``NAME`` or ``NAME:key=value,...``; the keys are the attributes.
-
-        Raises
-        ------
-        InputError
-            Unknown name or key, or a value out of range.
-        """
+        """Read ``NAME`` or ``NAME:key=value,...``; the keys are the attributes."""
         name, _, rest = text.strip().partition(':')
         given: dict[str, Any] = assignments(rest, f"Recording '{name}'", _OPTIONS)
         return cls(name, **given)
@@ -93,23 +87,10 @@ class Historian:
     def record(
         self, start_ns: int, signals: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> tuple[IntArray, dict[str, FloatArray]]:
-        """Record signals that were sampled every second.
+        """Return times, int64 (m,), and columns of signals (n,) that were sampled every second.
 
-        Parameters
-        ----------
-        start_ns : int
-            Time of the first sample.
-        signals : mapping of str to float64 (n,)
-            Signals by column; not changed.
-        rng : numpy.random.Generator
-            Used for scans and dropouts; the number of draws is the same for all recordings.
-
-        Returns
-        -------
-        time_ns : int64 (m,)
-            Increasing.
-        columns : dict of float64 (m,)
-            NaN if a value is missing or, with own times, if there is no new value.
+        NaN means that a value is missing or, with own times, that there is no new value. The
+        number of random draws, for scans and dropouts, is the same for all recordings.
         """
         there = self._there(signals, rng)
         scans = self._scans(signals, rng)
@@ -174,10 +155,9 @@ class Historian:
         seconds = np.arange(-(-begin // step) * step, _length(signals), step, dtype=np.int64)
         columns = {}
         for name, column in signals.items():
-            places = np.flatnonzero(kept[name])
-            last = np.searchsorted(places, seconds, side='right') - 1
-            values = column[places] if places.size else np.array([np.nan])
-            columns[name] = np.where(last >= 0, values[np.maximum(last, 0)], np.nan)
+            stored = np.where(kept[name], np.arange(column.size), -1)
+            last = np.maximum.accumulate(stored)[seconds]
+            columns[name] = np.where(last >= 0, column[last], np.nan)
         return seconds, columns
 
 

@@ -116,9 +116,7 @@ class Outside:
 class Drive(Protocol):
     """The operation of the unit: load programme or manual opening."""
 
-    @property
-    def manual(self) -> bool:
-        """Return True if the opening is set by hand and the power control is off."""
+    manual: bool  # the opening is set by hand and the power control is off
 
     def advance(self, first: int, count: int) -> Outside:
         """Return rows ``[first, first + count)``; must be called in the order of the rows."""
@@ -190,10 +188,11 @@ class Pulses:
 class LoadProgramme:
     """The unit under power control, as in section IV of the paper and with frequency control."""
 
+    manual = False
+
     def __init__(self, unit: UnitDescription, seed: int, length_s: float, clock_s: float) -> None:
         plan, h = unit.programme, unit.sample_period_s
-        self._plan = plan
-        self._step_s = h
+        self._plan, self._step_s = plan, h
         self._knots = load_knots(generator(seed, ChanceSource.LOAD), length_s, clock_s, plan)
         self._pulses = Pulses.draw(generator(seed, ChanceSource.PULSES), length_s, plan)
         self._sliding = LowPass(plan.pressure_lag_s, h)
@@ -203,11 +202,6 @@ class LoadProgramme:
             generator(seed, ChanceSource.TEMPERATURE), plan.temperature_wander_s, h
         )
         self._jitter = Wander(generator(seed, ChanceSource.JITTER), plan.jitter_s, h)
-
-    @property
-    def manual(self) -> bool:
-        """Return False, because the power control is on."""
-        return False
 
     def advance(self, first: int, count: int) -> Outside:
         """Return rows ``[first, first + count)``."""
@@ -285,10 +279,8 @@ class Plant:
     def __init__(
         self, hooks: Hooks, drive: Drive, seed: int, first_row: int, clock_s: float
     ) -> None:
-        self._hooks = hooks
-        self._drive = drive
+        self._hooks, self._drive, self._clock_s = hooks, drive, clock_s
         self._row = self._first_row = first_row
-        self._clock_s = clock_s
         self._loop = ClosedLoop(hooks, drive.manual)
         self._disturbance = Disturbance(hooks.unit, seed)
         self._sensors = [

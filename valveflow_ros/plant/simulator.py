@@ -21,12 +21,9 @@ from valveflow_ros.records import NS_PER_S, FloatArray, SampleTable, Signal
 # The historian's record of a plant: stamps, rounding, faults of the record.
 
 DECIMALS = {
-    Signal.VALVE_OPENING: 2,
-    Signal.MAIN_STEAM_PRESSURE: 3,
-    Signal.MAIN_STEAM_TEMPERATURE: 1,
-    Signal.GENERATED_POWER: 2,
-    Signal.VALVE_COMMAND: 2,
-}
+    Signal.VALVE_OPENING: 2, Signal.MAIN_STEAM_PRESSURE: 3, Signal.MAIN_STEAM_TEMPERATURE: 1,
+    Signal.GENERATED_POWER: 2, Signal.VALVE_COMMAND: 2,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +64,7 @@ class Recorder:
     """Convert the rows of a plant into tables, with early stamps of the power if required."""
 
     def __init__(self, hooks: Hooks, start_ns: int, active: tuple[EffectSpec, ...]) -> None:
-        self._hooks = hooks
-        self._start_ns = start_ns
-        self._active = active
+        self._hooks, self._start_ns, self._active = hooks, start_ns, active
         self._shift = hooks.lead_s / hooks.unit.sample_period_s
         self.ahead = max(0, math.ceil(self._shift))
         self.behind = max(0, math.ceil(-self._shift))
@@ -122,59 +117,34 @@ DEFAULT_START_NS = 1_700_006_400 * NS_PER_S  # 2023-11-15 00:00:00 UTC, a midnig
 
 
 def simulate(
-    days: float,
-    seed: int,
-    unit: UnitDescription | None = None,
-    start_ns: int = DEFAULT_START_NS,
-    effects: Sequence[EffectSpec] = (),
-) -> SimulatedLog:
-    """Simulate ``days`` of operation.
+    days: float, seed: int, unit: UnitDescription | None = None,
+    start_ns: int = DEFAULT_START_NS, effects: Sequence[EffectSpec] = (),
+) -> SimulatedLog:  # fmt: skip
+    """Simulate ``days`` of operation, at most 400, of the paper's unit or another one.
 
-    Parameters
-    ----------
-    days : float
-        Duration, more than 0 and at most 400.
-    seed : int
-        It determines every random number. The numbers do not depend on the effects,
-        and a longer run begins with the shorter one.
-    unit : UnitDescription, optional
-        Defaults to the unit of the paper's simulation study.
-    start_ns : int
-        Time of the first row, ns since 1970; it determines the time of day in UTC.
-    effects : sequence of EffectSpec
-        Effects to switch on; their order has no influence.
+    The seed determines every random number; they do not depend on the effects, whose order has no
+    influence, and a longer run begins with the shorter one. ``start_ns`` determines the time of
+    day in UTC. A row needs about 90 bytes, and twice this while the parts are joined: ten days at
+    1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`.
 
     Raises
     ------
     InputError
         ``days``, ``seed`` or ``start_ns`` is out of range, or effects cannot
         act in this run or not together.
-
-    Notes
-    -----
-    A row needs about 90 bytes, and twice this while the parts are joined: ten days
-    at 1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`.
     """
     return SimulatedLog.joined(list(simulate_parts(days, seed, unit, start_ns, effects)))
 
 
 def simulate_parts(
-    days: float,
-    seed: int,
-    unit: UnitDescription | None = None,
-    start_ns: int = DEFAULT_START_NS,
-    effects: Sequence[EffectSpec] = (),
-    part_s: float = DAY_S,
-) -> Iterator[SimulatedLog]:
+    days: float, seed: int, unit: UnitDescription | None = None,
+    start_ns: int = DEFAULT_START_NS, effects: Sequence[EffectSpec] = (), part_s: float = DAY_S,
+) -> Iterator[SimulatedLog]:  # fmt: skip
     """Simulate as `simulate` does and yield the run in consecutive parts of ``part_s``.
 
     The state continues from part to part: the joined parts are equal to the result
     of `simulate`, bit for bit, for any ``part_s``. One part is in memory at a time.
-
-    Raises
-    ------
-    InputError
-        Raised at the call, before the simulation; see `simulate`.
+    Errors are raised at the call, before the simulation.
     """
     unit = unit or UnitDescription()
     if not 0.0 < days <= LONGEST_DAYS:
@@ -196,13 +166,7 @@ def simulate_parts(
 
 
 def prepare(hooks: Hooks, seed: int, start_ns: int, effects: Sequence[EffectSpec]) -> Recorder:
-    """Check the arguments of a run, install the effects, and return the recorder.
-
-    Raises
-    ------
-    InputError
-        See `simulate`.
-    """
+    """Check the arguments of a run as `simulate`, install the effects, return the recorder."""
     if seed < 0:
         raise InputError(f'The seed must be 0 or more, not {seed}.')
     end_ns = start_ns + round(hooks.length_s * NS_PER_S)

@@ -92,10 +92,7 @@ def thermal_catalogue() -> dict[str, Effect]:
 def thermal_effect(given: str | EffectSpec, kind: str) -> EffectSpec:
     """Return an effect from its text, after checking that it can act on a thermal unit.
 
-    Raises
-    ------
-    InputError
-        As in `EffectSpec.parse`, or an effect that only acts on the paper's curve or regions.
+    Raises `InputError` as `EffectSpec.parse`, and for one of the paper's curve or regions.
     """
     known = thermal_catalogue()
     name = given.partition(':')[0].strip() if isinstance(given, str) else given.name

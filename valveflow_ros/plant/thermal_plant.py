@@ -123,38 +123,19 @@ class ThermalLog:
 
 
 def simulate_thermal(
-    days: float,
-    seed: int,
-    unit: ThermalUnit | None = None,
-    historian: Historian | None = None,
-    start_ns: int = DEFAULT_START_NS,
-    effects: Sequence[str | EffectSpec] = (),
-) -> ThermalLog:
-    """Simulate ``days`` of operation of a thermal unit.
+    days: float, seed: int, unit: ThermalUnit | None = None, historian: Historian | None = None,
+    start_ns: int = DEFAULT_START_NS, effects: Sequence[str | EffectSpec] = (),
+) -> ThermalLog:  # fmt: skip
+    """Simulate ``days`` of operation, at most 60, of a thermal unit; a day needs about 50 MB.
 
-    Parameters
-    ----------
-    days : float
-        Duration, more than 0 and at most 60.
-    seed : int
-        It determines every random number, for all effects and recordings.
-    unit : ThermalUnit, optional
-        By default a unit of the kind 'choked'.
-    historian : Historian, optional
-        By default every sample is stored.
-    start_ns : int
-        Time of the first sample, ns since 1970; it determines the time of day in UTC.
-    effects : sequence of str or EffectSpec
-        Effects of `thermal_catalogue` to switch on; their order has no influence.
+    The seed determines every random number, for all effects of `thermal_catalogue`, whose order
+    has no influence, and all recordings. ``start_ns`` determines the time of day in UTC. By
+    default the unit is of the kind 'choked' and every sample is stored.
 
     Raises
     ------
     InputError
         An argument is out of range, or effects cannot act in this run or not together.
-
-    Notes
-    -----
-    A day needs about 50 MB.
     """
     unit, historian = unit or ThermalUnit(), historian or Historian()
     if not 0.0 < days <= LONGEST_DAYS:

@@ -26,19 +26,11 @@ def refuse_unless(what: str, *checks: tuple[bool | np.bool_, str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A piecewise-linear flow characteristic x = F(u), eq. (2).
+    """A piecewise-linear flow characteristic x = F(u), eq. (2)."""
 
-    Attributes
-    ----------
-    knots : float64 (J + 1,)
-        Boundaries of the pieces, % MPa^(9/8), increasing.
-    slopes, intercepts : float64 (J,)
-        MW per unit of u, and MW.
-    """
-
-    knots: FloatArray
-    slopes: FloatArray
-    intercepts: FloatArray
+    knots: FloatArray  # (J + 1,) increasing boundaries of the pieces, % MPa^(9/8)
+    slopes: FloatArray  # (J,) MW per unit of u
+    intercepts: FloatArray  # (J,) MW
 
     def __post_init__(self) -> None:
         if len(self.knots) != len(self.slopes) + 1 or len(self.slopes) != len(self.intercepts):
