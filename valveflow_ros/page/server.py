@@ -288,7 +288,10 @@ class PageServer:
             _quiet()
             app, policy = make_app(shown, asking, zone)
             self._sockets: dict[int, Any] = {}
-            metrics = Metrics(shown, lambda: {**counters(), **self._counters()})
+            refused = 'valveflow_page_requests_refused'
+            metrics = Metrics(
+                shown, lambda: counters() | {refused: ('Requests refused.', self.guard.refused)}
+            )
             # The guard reports errors as a sentence.
             app.server.config['PROPAGATE_EXCEPTIONS'] = True
             self.guard = Guard(app.server, policy, metrics.text, names, self.connections, complain)
@@ -336,9 +339,6 @@ class PageServer:
         for channel in list(self._sockets.values()):
             channel.close()
         self._sockets.clear()
-
-    def _counters(self) -> dict[str, tuple[str, float]]:
-        return {'valveflow_page_requests_refused': ('Requests refused.', self.guard.refused)}
 
     def _run(self) -> None:
         # At the end the sockets are closed during the wait.

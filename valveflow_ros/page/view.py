@@ -102,13 +102,6 @@ def _head(unit: Snapshot, zone: tzinfo | None) -> list[Any]:
     return [*made, html.P(note, className='notice')] if note else made
 
 
-def _diagnosis(frame: Frame, zone: tzinfo | None) -> list[Any]:
-    found = frame.diagnosis
-    said = views.diagnosis_words(None if found is None else replace(found, advice=()))
-    advice = () if found is None else found.advice
-    return [_said(said, zone), *(html.P(clean(in_zone(one, zone))) for one in advice)]
-
-
 def _row(item: HealthView, zone: tzinfo | None) -> Any:
     word, tone = _LEVELS.get(item.level, (f'level {item.level}', 'bad'))
     return html.Tr([
@@ -130,21 +123,19 @@ def _health(frame: Frame, zone: tzinfo | None) -> list[Any]:
 
 def words(unit: Snapshot, zone: tzinfo | None = None) -> dict[str, list[Any]]:
     """Return the content of each of `PARTS` as Dash components; times in a zone, or in UTC."""
-    frame = unit.frame
+    frame, curve, found = unit.frame, unit.frame.curve, unit.frame.diagnosis
+    # The age of the curve in whole minutes, so that it does not change every second.
+    now_ns = max(0 if curve is None else curve.window[1], frame.now_ns - frame.now_ns % MINUTE_NS)
+    said = views.diagnosis_words(None if found is None else replace(found, advice=()))
+    advice = () if found is None else found.advice
     return {
         'head': _head(unit, zone),
         'alarms': [_said(said, zone) for said in views.alarms_words(frame)],
-        'curve_words': [_said(views.curve_words(frame.curve, _whole_minute(frame)), zone)],
+        'curve_words': [_said(views.curve_words(curve, now_ns), zone)],
         'now': [_said(views.sample_words(frame.last), zone)],
-        'diagnosis': _diagnosis(frame, zone),
+        'diagnosis': [_said(said, zone), *(html.P(clean(in_zone(a, zone))) for a in advice)],
         'health': _health(frame, zone),
     }
-
-
-def _whole_minute(frame: Frame) -> int:
-    """Return the time rounded to minutes, so that displayed ages do not change every second."""
-    end_ns = 0 if frame.curve is None else frame.curve.window[1]
-    return max(end_ns, frame.now_ns - frame.now_ns % (60 * NS_PER_S))
 
 
 # Figures, in the format of `report.figure`: colours by name.
@@ -266,10 +257,11 @@ class Maker:
         """Return every part of a unit by its name."""
         frame, day, zone = unit.frame, unit.day, self.zone
         live = (frame.now_ns, frame.last, frame.curve)
-        told = self._once(
-            unit, 'words', (frame, unit.present), lambda: _versions(words(unit, zone))
-        )
-        return dict(told.content) | {
+
+        def told() -> dict[str, Made]:
+            return {name: Made(_digest(made), made) for name, made in words(unit, zone).items()}
+
+        return dict(self._once(unit, 'words', (frame, unit.present), told).content) | {
             'curve': self._once(unit, 'curve', live, lambda: curve_picture(frame)),
             'recent': self._once(unit, 'recent', live[:2], lambda: recent_picture(frame, zone)),
             'day': self._once(unit, 'day', day[:1] + day[-1:], lambda: day_picture(unit, zone)),
@@ -294,10 +286,6 @@ _MOST_KEPT = 8 * MOST_UNITS
 
 def _digest(*parts: object) -> str:
     return sha256(repr(parts).encode()).hexdigest()[:12]
-
-
-def _versions(told: Mapping[str, Any]) -> dict[str, Made]:
-    return {name: Made(_digest(content), content) for name, content in told.items()}
 
 
 # The page.
@@ -355,7 +343,11 @@ def _block(number: int, told: Mapping[str, Made], may_ask: bool) -> Any:
 def _page(maker: Maker, may_ask: bool) -> Any:
     units = maker.shown.units
     blocks = [_block(k, maker.parts(unit), may_ask) for k, unit in enumerate(units)]
-    blocks = blocks or [_nowhere()]
+    # Without any part, Dash would not tick at all.
+    nowhere = [_part(-1, name) for name in PARTS]
+    blocks = blocks or [
+        html.Div([*nowhere, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
+    ]
     token_field = [
         html.Label(['Token for the buttons: ', dcc.Input(id='token', type='password', value='')],
                    className='token'),
@@ -371,12 +363,6 @@ def _page(maker: Maker, may_ask: bool) -> Any:
         dcc.Interval(id='tick', interval=TICK_MS), dcc.Interval(id='pulse', interval=1000),
         dcc.Store(id='seen', data={'generation': maker.generation}),
     ], id='page')  # fmt: skip
-
-
-def _nowhere() -> Any:
-    """Return the parts of a dummy unit: without any part, Dash would not tick at all."""
-    parts = [_part(-1, name) for name in PARTS]
-    return html.Div([*parts, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
 
 
 class Asking:
@@ -438,7 +424,8 @@ def make_app(
     _update(app, maker)
     if asking is not None:
         _answer(app, shown, asking)
-    inline = [*app.csp_hashes(), _hash(script)]
+    own = b64encode(sha256(script.encode()).digest()).decode()
+    inline = [*app.csp_hashes(), f"'sha256-{own}'"]
     return app, (
         f"default-src 'self'; script-src 'self' {' '.join(inline)}; "
         "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
@@ -448,10 +435,6 @@ def make_app(
 
 def _file(name: str) -> str:
     return resources.files('valveflow_ros.page').joinpath(name).read_text(encoding='utf-8')
-
-
-def _hash(script: str) -> str:
-    return f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'"
 
 
 def _index(script: str) -> str:

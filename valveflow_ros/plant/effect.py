@@ -179,10 +179,6 @@ def _starts(values: Values) -> float:
     return float(dict(values.pairs).get('t0_days', 0.0))
 
 
-def _no_problem(values: Values) -> str:
-    return ''
-
-
 def not_above(*pairs: tuple[str, str]) -> Callable[[Values], str]:
     """Return a check that the first parameter of each pair does not exceed the second."""
 
@@ -191,6 +187,9 @@ def not_above(*pairs: tuple[str, str]) -> Callable[[Values], str]:
         return next(said, '')
 
     return problem
+
+
+_no_problem = not_above()
 
 
 @dataclass(frozen=True, slots=True)

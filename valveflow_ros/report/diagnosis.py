@@ -74,29 +74,31 @@ def _drifts(d: Diagnosis) -> bool:
 
 
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
-    d = data.diagnosis
-    said = html.text(d.sentence)
+    d, said = data.diagnosis, html.text(data.diagnosis.sentence)
     good = d.verdict == NOTHING and not _drifts(d)
-    parts: list[str | Figure] = [html.paragraph(said, 'good') if good else html.notice(said)]
-    for c in d.causes:
-        if c.not_told_apart:
-            names = html.text(listed((c.name, *c.not_told_apart)))
-            parts.append(html.notice(f'What would tell {names} apart: {html.text(c.experiment)}'))
-    for c in d.causes:
-        if c.to_do:
-            known = f': {html.text(c.meaning)}' if c.meaning else '.'
-            parts.append(html.paragraph(
-                f'<b>{html.text(c.name)}</b>{known} <b>What to do:</b> {html.text(c.to_do)}'
-            ))  # fmt: skip
-    parts.append(html.paragraph(
-        'On held-out data, the simulation differs from the measured '
-        f'power by {say.level(d.rmse_simulation, 2)} MW, the extended model by '
+    apart = (
+        f'What would tell {html.text(listed((c.name, *c.not_told_apart)))} apart: '
+        f'{html.text(c.experiment)}'
+        for c in d.causes
+        if c.not_told_apart
+    )
+    advice = (
+        f'<b>{html.text(c.name)}</b>{f": {html.text(c.meaning)}" if c.meaning else "."} '
+        f'<b>What to do:</b> {html.text(c.to_do)}'
+        for c in d.causes
+        if c.to_do
+    )
+    proof = (
+        'On held-out data, the simulation differs from the measured power by '
+        f'{say.level(d.rmse_simulation, 2)} MW, the extended model by '
         f'{say.level(d.rmse_extended, 2)} MW; {say.floor_words(d.disturbance is not None)} about '
         f'{say.level(d.rmse_noise_floor, 2)} MW.'
-    ))  # fmt: skip
-    if ranked:
-        parts.append(signature_figure(ranked[0], data, _HOW))
-    return Section('The answer', parts)
+    )
+    return html.section(
+        'The answer', html.paragraph(said, 'good') if good else html.notice(said),
+        *map(html.notice, apart), *map(html.paragraph, (*advice, proof)),
+        signature_figure(ranked[0], data, _HOW) if ranked else None,
+    )  # fmt: skip
 
 
 def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
@@ -105,25 +107,22 @@ def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
          *(say.percent(share) for share in (s.share_before, s.share_after, s.share_chance))]
         for s in ranked
     ]  # fmt: skip
-    parts: list[str | Figure] = [
+    return html.section(
+        '1. What is wrong',
         html.paragraph(
             'The simulation (curve and regional dynamics) was run on the measured opening and '
             'pressure. How much of the difference to the measured power depends on each variable:'
         ),
         html.table(['variable', 'simulation', 'extended model', 'by chance (99 %)'], rows),
         *(signature_figure(s, data) for s in ranked[1:]),
-    ]
-    if data.answers:
-        parts.append(answer_figure(data.answers))
-    parts += [map_figure(m, data) for m in data.maps if m.shown_before or m.shown_after]
-    return Section('1. What is wrong', parts)
+        answer_figure(data.answers) if data.answers else None,
+        *(map_figure(m, data) for m in data.maps if m.shown_before or m.shown_after),
+    )
 
 
 def _why(data: Diagnosed) -> Section:
     d = data.diagnosis
-    parts = [html.paragraph(html.text(c.sentence)) for c in d.causes] or [
-        html.paragraph(html.text(d.sentence))
-    ]
+    parts = [html.paragraph(html.text(c.sentence)) for c in d.causes or (d,)]
     for c in d.causes:
         if c.switches_s:
             spans = times_in_effect(c.switches_s, data.start_ns, data.end_ns)
@@ -134,73 +133,62 @@ def _why(data: Diagnosed) -> Section:
                 f'{html.text(", ".join(c.not_told_apart))} with these data. What would tell '
                 f'them apart: {html.text(c.experiment)}'
             ))  # fmt: skip
-    if d.unexplained_by:
-        parts.append(
-            html.notice(f'Unexplained: depends on {html.text(" and ".join(d.unexplained_by))}.')
-        )
-    if d.disturbance:
-        parts.append(html.paragraph(html.text(d.disturbance.sentence)))
-    if d.rejected:
-        said = 'Other causes, and why they are not named:'
-        parts.append(html.paragraph(said) + html.bullets(
-            f'<b>{html.text(n)}</b>: {html.text(reason)}' for n, reason in d.rejected
-        ))  # fmt: skip
-    return Section('2. Why', [*parts, *(html.paragraph(html.text(note)) for note in d.notes)])
+    rest = html.text(' and '.join(d.unexplained_by))
+    others = (f'<b>{html.text(name)}</b>: {html.text(reason)}' for name, reason in d.rejected)
+    return html.section(
+        '2. Why', *parts,
+        html.notice(f'Unexplained: depends on {rest}.') if rest else None,
+        html.paragraph(html.text(d.disturbance.sentence)) if d.disturbance else None,
+        html.paragraph('Other causes, and why they are not named:') + html.bullets(others)
+        if d.rejected else None,
+        *(html.paragraph(html.text(note)) for note in d.notes),
+    )  # fmt: skip
 
 
 def _model(data: Diagnosed) -> Section:
     d = data.diagnosis
     names = f', and {", ".join(html.text(n) for n in d.final.names)}.' if d.final.names else '.'
-    parts: list[str | Figure] = [html.paragraph(
+    words = (
         f'A curve of {say.counted(d.final.base.pieces, "piece")}, '
         f'{say.counted(d.final.base.regions, "region")} of dynamics{names}'
-    )]  # fmt: skip
+    )
     rows = [
         [html.text(c.name), html.text(key), *(html.text(cell) for cell in cells(e, data.exponent))]
         for c in d.causes
         for key, e in c.parameters.items()
     ]
-    if rows:
-        head = ['cause', 'parameter', 'value', '95 % interval']
-        parts.append(html.table(head, rows, sentences=True))
-    return Section('3. The extended model', parts)
+    head = ['cause', 'parameter', 'value', '95 % interval']
+    values = html.table(head, rows, sentences=True) if rows else ''
+    return html.section('3. The extended model', html.paragraph(words), values)
 
 
 def _proof(data: Diagnosed) -> Section:
     d = data.diagnosis
-    rows = [
+    errors = [
         ['simulation', say.level(d.rmse_simulation, 3)],
         ['extended model', say.level(d.rmse_extended, 3)],
-        [
-            f'{say.floor_words(d.disturbance is not None)} (estimate)',
-            say.level(d.rmse_noise_floor, 3),
-        ],
-    ]
-    parts: list[str | Figure] = [
+        [f'{say.floor_words(d.disturbance is not None)} (estimate)',
+         say.level(d.rmse_noise_floor, 3)],
+    ]  # fmt: skip
+    gains = [
+        [html.text(c.name), say.level(c.gain.rmse_before, 3), say.level(c.gain.rmse_after, 3),
+         say.percent(c.gain.reduction), say.plain(c.gain.p_value, 2)]
+        for c in d.causes if math.isfinite(c.gain.p_value)
+    ]  # fmt: skip
+    told = html.paragraph(
+        'What each cause gains there; p is the probability of such a gain by chance, '
+        'corrected for the number of causes tried:'
+    ) + html.table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], gains)
+    return html.section(
+        '4. Check on held-out data',
         html.paragraph(
             'Every fifth block of the record was held out: nothing was fitted to it, and it was '
             'used once. Root mean square difference there, of means over '
             f'{say.duration(d.mean_s)}:'
         ),
-        html.table(['model', 'MW'], rows),
-    ]
-    gains = [(c.name, c.gain) for c in d.causes if math.isfinite(c.gain.p_value)]
-    if gains:
-        rows = [
-            [html.text(name), say.level(g.rmse_before, 3), say.level(g.rmse_after, 3),
-             say.percent(g.reduction), say.plain(g.p_value, 2)]
-            for name, g in gains
-        ]  # fmt: skip
-        parts += [
-            html.paragraph(
-                'What each cause gains there; p is the probability of such a gain by chance, '
-                'corrected for the number of causes tried:'
-            ),
-            html.table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], rows),
-        ]
-    if d.segments:
-        parts.append(segments_figure(d.segments))
-    return Section('4. Check on held-out data', parts)
+        html.table(['model', 'MW'], errors), told if gains else None,
+        segments_figure(d.segments) if d.segments else None,
+    )  # fmt: skip
 
 
 # Presentation of a diagnosis: names of variables, parameters, times as dates.

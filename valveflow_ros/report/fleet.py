@@ -59,7 +59,7 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
     # The change began in the first of the last consecutive logs that all show it.
     changed: list[Row] = []
     for row in reversed(curves):
-        if not row.get('change_moved') or not _same_side(row, last):
+        if not row.get('change_moved') or (row['change_mw'] < 0.0) != (last['change_mw'] < 0.0):
             break
         changed.insert(0, row)
     named = dict.fromkeys(c['name'] for row in changed for c in row.get('causes') or ())
@@ -79,10 +79,6 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
         last.get('change_mean_mw'), piece, _since(changed[0]) if changed else '', tuple(named),
         tuple(dict.fromkeys(alarms)), tuple(changes), tuple(failures), _history(curves),
     )  # fmt: skip
-
-
-def _same_side(row: Row, last: Row) -> bool:
-    return bool((row['change_mw'] < 0.0) == (last['change_mw'] < 0.0))
 
 
 def _since(row: Row) -> str:
@@ -124,13 +120,9 @@ def _link(words: str, *parts: str) -> str:
     return f'<a href="{"/".join(quote(p, safe="") for p in parts)}">{words}</a>'
 
 
-def _by_loss(story: UnitStory) -> tuple[bool, float, str]:
-    return not story.moved, story.change_mw or 0.0, story.unit
-
-
 def fleet_page(stories: Sequence[UnitStory]) -> Page:
     """Return the overview of all units."""
-    ordered = sorted(stories, key=_by_loss)
+    ordered = sorted(stories, key=lambda s: (not s.moved, s.change_mw or 0.0, s.unit))
     moved = [s for s in ordered if s.moved]
     less = [s for s in moved if (s.change_mw or 0.0) < 0.0]
     logs, failed = sum(s.logs for s in stories), sum(s.failed for s in stories)

@@ -81,6 +81,11 @@ class Section:
     parts: list[str | Figure] = field(default_factory=list)
 
 
+def section(title: str, *parts: str | Figure | None) -> Section:
+    """Return a section; parts that are empty or None are left out."""
+    return Section(title, [part for part in parts if part])
+
+
 @dataclass(frozen=True, slots=True)
 class Page:
     """A report before it is written, as one page or as separate figures."""
@@ -100,9 +105,9 @@ class Page:
         if zone is None:
             return self
         page = self._said(lambda text: in_zone(text, zone))
-        for section in page.sections:
-            section.parts[:] = [
-                pictures.in_zone(p, zone) if isinstance(p, Figure) else p for p in section.parts
+        for s in page.sections:
+            s.parts[:] = [
+                pictures.in_zone(p, zone) if isinstance(p, Figure) else p for p in s.parts
             ]
         return page
 
@@ -236,9 +241,9 @@ def notice(html: str) -> str:
     return f'<p class="notice" role="note">{html}</p>'
 
 
-def _section(number: int, section: Section) -> str:
-    parts = ''.join(_figure(p) if isinstance(p, Figure) else p for p in section.parts)
-    return f'<section id="part-{number + 1}"><h2>{text(section.title)}</h2>{parts}</section>'
+def _section(number: int, told: Section) -> str:
+    parts = ''.join(_figure(p) if isinstance(p, Figure) else p for p in told.parts)
+    return f'<section id="part-{number + 1}"><h2>{text(told.title)}</h2>{parts}</section>'
 
 
 def _figure(figure: Figure) -> str:

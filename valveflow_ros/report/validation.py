@@ -19,7 +19,7 @@ from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import misfit_words
 from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
-from valveflow_ros.report.page import Page, Section
+from valveflow_ros.report.page import Page
 from valveflow_ros.segments.window import WindowContents
 
 LABELS = {
@@ -133,21 +133,20 @@ def validation_page(data: Validated) -> Page:
     first, *rest = verdict_words(data)
     flag = v.outside_share > OUTSIDE_FLAG
     sections = [
-        Section('The verdict', [
+        html.section(
+            'The verdict',
             html.paragraph(html.text(first), 'answer'),
             *((html.notice if flag and 'beyond the ends' in s else html.paragraph)(html.text(s))
               for s in rest),
-            html.notice(html.text(data.held)) if data.held else '',
-            input_figure(v),
+            html.notice(html.text(data.held)) if data.held else None, input_figure(v),
             pieces_table(v),
-        ]),
-        Section('When it differs', [time_figure(v)]),
-        Section('Predictions', [totals_table(v), segments_table(v)]),
+        ),
+        html.section('When it differs', time_figure(v)),
+        html.section('Predictions', totals_table(v), segments_table(v)),
     ]  # fmt: skip
     if data.notes:
-        sections.append(
-            Section('How the data were read', [html.bullets(map(html.text, data.notes))])
-        )
+        notes = html.bullets(map(html.text, data.notes))
+        sections.append(html.section('How the data were read', notes))
     end = html.foot(
         f'Curve <code>{html.text(v.characteristic.model_id)}</code>; the same numbers, unrounded, '
         'stand in validation.json and segments.csv.'
