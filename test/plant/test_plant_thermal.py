@@ -169,13 +169,6 @@ def test_the_seed_decides_what_happens_and_the_record_changes_nothing(recording:
 # Effects.
 
 
-def test_a_healthy_valve_stands_where_its_sensor_says() -> None:
-    log = quiet_log()
-    np.testing.assert_array_equal(log.truth.stem, log.truth.plug)
-    shown = log.table.values[:, [Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]].T
-    np.testing.assert_allclose(shown, (log.truth.plug, log.truth.pressure), atol=2e-6)
-
-
 EARLY = {
     'area_step': 't0_days=0.02', 'gain_step': 't0_days=0.02', 'input_step': 't0_days=0.02',
     'flatline': 't0_days=0.05,minutes=30', 'spikes': 'per_day=500',
@@ -234,14 +227,6 @@ def test_area_and_efficiency_change_flow_or_power_at_their_moment(
     lost = of_flow * QUIET.no_load_mw
     power = 0.97 * (QUIET.static_power(true.plug, true.pressure) + lost) - lost
     assert np.median((true.power - power)[5000:]) == pytest.approx(0.0, abs=0.3)
-
-
-@pytest.mark.parametrize('lead_s', [12.0, -7.5])
-def test_another_clock_moves_the_power(lead_s: float) -> None:
-    seconds, power = np.arange(8640), Signal.GENERATED_POWER
-    expected = np.interp(seconds + lead_s, seconds, quiet_log().table.column(power))
-    shown = quiet_log(f'clock:d_s={lead_s}').table.column(power)
-    np.testing.assert_allclose(shown[20:-20], expected[20:-20], atol=2e-6)
 
 
 def test_temperature_changes_the_power_per_kelvin() -> None:

@@ -21,7 +21,7 @@ from report_stories import START_NS, diagnosed, history
 from valveflow_ros.errors import InputError
 from valveflow_ros.report import drawing, first_run
 from valveflow_ros.report.diagnosis import diagnosis_page
-from valveflow_ros.report.drawing import figure_files, palette
+from valveflow_ros.report.drawing import figure_files
 from valveflow_ros.report.figure import Figure, figure_csv, numbers, packed, plain_text
 from valveflow_ros.report.identification import identification_page
 
@@ -57,11 +57,6 @@ def test_without_matplotlib_one_sentence_says_what_to_do(figures, monkeypatch):
     monkeypatch.setattr(drawing, 'find_spec', lambda name: None)
     with pytest.raises(InputError, match='pip install matplotlib'):
         figure_files(figures['curve'])
-
-
-def test_every_colour_of_a_picture_is_known(figures):
-    for figure in figures.values():
-        assert set(re.findall(r'token:([a-z0-9-]+)', figure.to_json())) <= set(palette())
 
 
 def test_the_table_of_the_curve_has_its_ends_and_the_cloud(figures, identified):

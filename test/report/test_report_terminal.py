@@ -150,6 +150,7 @@ def test_a_line_reaches_from_end_to_end_without_a_gap():
     assert rows[0][-1] != ' '
 
 
+@settings(max_examples=30)
 @given(texts)
 def test_clean_text_is_one_printable_line_that_cannot_command_the_terminal(text):
     assert all(c.isprintable() or c == '\u202f' for c in clean(text))
