@@ -180,37 +180,35 @@ def comparison_page(data: Compared) -> Page:
     spans = [say.period(part.time_ns[0], part.time_ns[-1]) for part in (data.learnt, data.judged)]
     shown = stretches(data)
     segments = [s for stretch in shown for s in stretch.segments]
-    moves = moves_figure(data)
     sections = [
-        Section('What came out', [
-            html.paragraph(html.text(first), 'answer'), curves_figure(data),
+        html.section(
+            'What came out', html.paragraph(html.text(first), 'answer'), curves_figure(data),
             pairs_table(data.result.pairs),
             *(html.paragraph(html.text(sentence)) for sentence in rest),
-        ]),
-        Section('The curves', [parameters_table(data)]),
-        *([Section('Against the truth', [errors_table(data), truth_figure(data)])]
-          if data.result.truth is not None else []),
-        Section('On data nobody has seen', [
-            totals_table(data), *(stretch_figure(data, s) for s in shown),
-            *([segments_table(data, segments)] if segments else []),
-        ]),
-        Section('Dynamics by load', [
-            *([dynamics_table(c.dynamics)] if c.dynamics else []),
-            html.paragraph(html.text(_linear_block_words(data))), *([moves] if moves else []),
-        ]),
-        Section('Why this number of pieces', [choice_figure(c.choice, max(1, len(c.pieces)))]),
+        ),
+        html.section('The curves', parameters_table(data)),
+        html.section('Against the truth', errors_table(data), truth_figure(data))
+        if data.result.truth is not None else None,
+        html.section(
+            'On data nobody has seen', totals_table(data),
+            *(stretch_figure(data, s) for s in shown),
+            segments_table(data, segments) if segments else None,
+        ),
+        html.section(
+            'Dynamics by load', dynamics_table(c.dynamics) if c.dynamics else None,
+            html.paragraph(html.text(_linear_block_words(data))), moves_figure(data),
+        ),
+        html.section('Why this number of pieces', choice_figure(c.choice, max(1, len(c.pieces)))),
         _tuning(data),
+        html.section('How the data were read', html.bullets(map(html.text, data.notes)))
+        if data.notes else None,
     ]  # fmt: skip
-    if data.notes:
-        sections.append(
-            Section('How the data were read', [html.bullets(map(html.text, data.notes))])
-        )
     end = html.foot(
         f'Curve <code>{html.text(c.model_id)}</code>; the same numbers, unrounded, stand in '
         'comparison.json and the tables beside this page.'
     )
     lead = html.where(data_words(data), ', and '.join(spans))
-    return Page('Three methods compared', lead, sections, end, 'compare')
+    return Page('Three methods compared', lead, [s for s in sections if s], end, 'compare')
 
 
 def _linear_block_words(data: Compared) -> str:
@@ -258,10 +256,11 @@ def _tuning(data: Compared) -> Section:
         f'{h.noise}, {_order(len(h.model.b), len(h.model.denominator))}.'
     )
     candidates = html.table(['candidate', '', 'mean squared error (MW²)'], rows)
-    return Section('How the other two were tuned', [
-        html.paragraph(html.text(words)), html.paragraph(html.text(sparse)),
+    return html.section(
+        'How the other two were tuned', html.paragraph(html.text(words)),
+        html.paragraph(html.text(sparse)),
         html.folded(f'The {say.counted(len(rows), "candidate")}', candidates),
-    ])  # fmt: skip
+    )  # fmt: skip
 
 
 # Figs. 7 and 11 of the paper: the curves.

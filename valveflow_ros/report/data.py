@@ -169,39 +169,24 @@ def coverage_figure(data: Identified) -> Figure | None:
     return Figure('coverage', caption, words, traces, layout, height=320)
 
 
-def _sent(data: Identified) -> list[SignalInfo]:
-    return [i for i in SIGNALS if np.isfinite(data.table.column(i.signal)).any()]
-
-
-def presence(data: Identified) -> tuple[FloatArray, FloatArray]:
-    """Return the fraction of expected rows that have a value, by signal and time interval.
-
-    Returns
-    -------
-    edges_ns : float64 (k + 1,)
-    share : float64 (signals, k)
-        0 to 1; a missing row counts as one without a value.
-    """
+def presence_figure(data: Identified) -> Figure | None:
+    """Return when values are missing; None if none are missing."""
+    sent = [i for i in SIGNALS if np.isfinite(data.table.column(i.signal)).any()]
+    if len(data.table) < 2 or not sent:
+        return None
     time_ns = data.table.time_ns
     span = int(time_ns[-1] - time_ns[0]) + data.period_ns
     k = max(1, min(_STRETCHES, span // (20 * data.period_ns)))
     edges = np.linspace(0.0, float(span), k + 1)
     place = np.minimum(((time_ns - time_ns[0]) / (span / k)).astype(np.int64), k - 1)
+    # A missing row counts as one without a value.
     expected = np.maximum(np.diff(np.ceil(edges / data.period_ns)), 1.0)
     known = np.isfinite(data.table.values)
-    rows = [np.bincount(place[known[:, i.signal]], minlength=k) for i in _sent(data)]
-    counts = np.array(rows, dtype=np.float64).reshape(-1, k)
-    return float(time_ns[0]) + edges, np.minimum(counts / expected, 1.0)
-
-
-def presence_figure(data: Identified) -> Figure | None:
-    """Return when values are missing; None if none are missing."""
-    if len(data.table) < 2:
+    counts = np.array([np.bincount(place[known[:, i.signal]], minlength=k) for i in sent])
+    share, edges = np.minimum(counts / expected, 1.0), edges + float(time_ns[0])
+    if share.min() >= _WHOLE:
         return None
-    edges, share = presence(data)
-    if not share.size or share.min() >= _WHOLE:
-        return None
-    names = [i.topic.replace('_', ' ') for i in _sent(data)]
+    names = [i.topic.replace('_', ' ') for i in sent]
     scale = ((0.0, 'steady'), (0.5, 'notice-rule'), (0.999, 'notice'), (1.0, 'density-1'))
     traces: list[Spec] = [
         {

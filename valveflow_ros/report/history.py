@@ -176,9 +176,8 @@ def history_sections(history: History | None) -> list[Section]:
         if history.diagnoses:
             told += f' and {say.counted(len(history.diagnoses), "diagnosis", "diagnoses")}'
         told += f' from {say.period(history.start_ns, history.end_ns)}.'
-        sections.append(Section('What the monitor said', [
-            html.paragraph(told), timeline_figure(history), alarms_table(history),
-        ]))  # fmt: skip
+        parts = html.paragraph(told), timeline_figure(history), alarms_table(history)
+        sections.append(html.section('What the monitor said', *parts))
     if history.notes:
         sections = sections or [Section('What the monitor said')]
         sections[-1].parts.extend(html.notice(html.text(n)) for n in history.notes)
@@ -204,16 +203,6 @@ def standing_spans(history: History, name: str = '') -> list[tuple[int, int]]:
     return sorted(
         (a, b) for n, state, a, b, _ in spans(history) if state in stands and name in ('', n)
     )
-
-
-def standing_s(history: History) -> float:
-    """Return the total time in which the condition of any alarm held, in s."""
-    held = standing_spans(history)
-    total, until = 0, -(1 << 62)
-    for begin, end in held:
-        total += max(0, end - max(begin, until))
-        until = max(until, end)
-    return total / 1e9
 
 
 def _names(history: History) -> list[str]:
@@ -309,11 +298,13 @@ def alarms_table(history: History) -> str:
         [say.moment(a.time_ns), _row_of(a.name), _WORDS[a.state], html.text(a.sentence)]
         for a in shown
     ]
-    stood = standing_s(history)
+    stood, until = 0, -(1 << 62)  # ns in which the condition of any alarm held
+    for begin, end in standing_spans(history):
+        stood += max(0, end - max(begin, until))
+        until = max(until, end)
     changes = say.counted(len(shown), 'change')
-    told = (
-        f'Some alarm stood for {say.duration(stood)} in all.' if stood else 'No alarm ever stood.'
-    )
+    held = f'Some alarm stood for {say.duration(stood / 1e9)} in all.'
+    told = held if stood else 'No alarm ever stood.'
     if len(history.alarms) > len(shown):
         told += f' The last {changes}:'
     body = html.table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)

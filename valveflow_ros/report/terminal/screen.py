@@ -9,10 +9,10 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import tzinfo
 from itertools import pairwise
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import TextIO
 
 from valveflow_ros.records import NS_PER_S
@@ -287,15 +287,14 @@ class Screen:
         self._colour = self.in_place and not known.get('NO_COLOR')
         self._unicode = (out.encoding or '').lower().replace('-', '').startswith('utf')
         self._before = Frame()
-        self._entered = False
-        self._handlers: dict[signal.Signals, object] = {}
+        self._open = ExitStack()
 
     def __enter__(self) -> Screen:
         """Prepare the terminal; termination signals raise `KeyboardInterrupt` from now on."""
-        self._handlers = _handled()
+        self._open.enter_context(ending())
         if self.in_place:
             self._out.write(_ENTER)
-            self._entered = True
+            self._open.callback(self._leave)
         return self
 
     def __exit__(
@@ -303,11 +302,12 @@ class Screen:
         trace: TracebackType | None,
     ) -> None:  # fmt: skip
         """Restore the terminal."""
-        if self._entered:
-            with suppress(OSError):
-                self._out.write(_LEAVE)
-                self._out.flush()
-        _put_back(self._handlers)
+        self._open.close()
+
+    def _leave(self) -> None:
+        with suppress(OSError):
+            self._out.write(_LEAVE)
+            self._out.flush()
 
     def show(self, frame: Frame) -> None:
         """Show a frame, or its changes since the last one."""
@@ -335,29 +335,15 @@ class Screen:
         )  # fmt: skip
 
 
-def _handled() -> dict[signal.Signals, object]:
-    """Make termination signals raise `KeyboardInterrupt`; return the earlier handlers."""
-    before: dict[signal.Signals, object] = {}
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        with suppress(ValueError):  # not in the main thread
-            before[number] = signal.signal(number, _interrupt)
-    return before
-
-
-def _put_back(handlers: Mapping[signal.Signals, object]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, handler)  # type: ignore[arg-type]
-
-
 @contextmanager
 def ending() -> Iterator[None]:
     """Make termination signals raise `KeyboardInterrupt` inside the context."""
-    before = _handled()
+    before = {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with suppress(ValueError):  # not in the main thread
+            before[number] = signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:
-        _put_back(before)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+        for number, handler in before.items():
+            signal.signal(number, handler)
