@@ -12,7 +12,7 @@ import time
 from contextlib import ExitStack, suppress
 
 import pytest
-from page_units import alarm, shown_now, told
+from page_units import alarm, predict, shown_now, told
 
 from valveflow_ros.errors import DataError, InputError, RecordingError, ValveflowError
 from valveflow_ros.page import server as module
@@ -119,6 +119,19 @@ def test_a_browser_is_sent_what_has_changed_and_no_more(serve):
     assert set(changed) == {
         'note', 'seen', '{"part":"alarms","unit":0}', '{"part":"head","unit":0}'
     }  # fmt: skip
+
+
+def test_hours_without_a_sample_are_a_gap():
+    pytest.importorskip('dash', reason='the page is an extra')
+    from valveflow_ros.page.view import day_picture
+
+    unit = told(seconds=130)
+    for k in range(7200, 7330):
+        predict(unit, k)
+    (found,) = shown_now(unit).units
+    *_, measured = day_picture(found)['data']
+    assert measured['y'].count(None) == 1
+    assert len(measured['y']) == 6
 
 
 REFUSED = {
