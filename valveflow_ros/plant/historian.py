@@ -19,12 +19,9 @@ from valveflow_ros.records import NS_PER_S, BoolArray, FloatArray, IntArray
 RECORDINGS = ('1s', 'minute', 'compressed')
 # Spans of the transmitters, to which a dead band in % refers; that of a position is 100 %.
 SPANS = {
-    'main_steam_pressure_mpa': 25.0,
-    'main_steam_temperature_degc': 600.0,
-    'generated_power_mw': 400.0,
-    'condenser_pressure_kpa': 20.0,
-    'grid_frequency_hz': 2.0,
-}
+    'main_steam_pressure_mpa': 25.0, 'main_steam_temperature_degc': 600.0,
+    'generated_power_mw': 400.0, 'condenser_pressure_kpa': 20.0, 'grid_frequency_hz': 2.0,
+}  # fmt: skip
 _MINUTE = 60
 _OPTIONS = (
     'band_percent', 'scan_low_s', 'scan_high_s', 'longest_s', 'resample_s',

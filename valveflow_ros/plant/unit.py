@@ -234,13 +234,10 @@ def random_unit(rng: np.random.Generator) -> UnitDescription:
     curve = _curve(rng, rated, u_low, u_full)
     low, near_full, full = curve(u_low + np.array([0.0, 0.7, 1.0]) * (u_full - u_low))
     return UnitDescription(
-        curve,
-        _regions(rng, low, full),
-        _noise(rng, rated),
+        curve, _regions(rng, low, full), _noise(rng, rated),
         _programme(rng, (low, near_full, full), (pressure_low, pressure_high), u_full - u_low),
-        _EXPONENT,
-        float(rng.choice([1.0, 2.0])),
-    )
+        _EXPONENT, float(rng.choice([1.0, 2.0])),
+    )  # fmt: skip
 
 
 def _curve(rng: np.random.Generator, rated: float, u_low: float, u_full: float) -> Curve:
@@ -279,13 +276,10 @@ def _noise(rng: np.random.Generator, rated: float) -> Noise:
     """Draw disturbances of 0.5 to 1.5 times those of the paper's unit."""
     scale = rated / _PAPER_RATED_MW
     return Noise(
-        slow_mw=2.0 * scale * rng.uniform(0.5, 1.5),
-        slow_time_s=rng.uniform(30.0, 120.0),
-        white_mw=2.2 * scale * rng.uniform(0.5, 1.5),
-        opening_percent=rng.uniform(0.01, 0.03),
-        pressure_mpa=rng.uniform(0.005, 0.015),
-        temperature_k=rng.uniform(0.1, 0.3),
-    )
+        slow_mw=2.0 * scale * rng.uniform(0.5, 1.5), slow_time_s=rng.uniform(30.0, 120.0),
+        white_mw=2.2 * scale * rng.uniform(0.5, 1.5), opening_percent=rng.uniform(0.01, 0.03),
+        pressure_mpa=rng.uniform(0.005, 0.015), temperature_k=rng.uniform(0.1, 0.3),
+    )  # fmt: skip
 
 
 def _programme(
@@ -298,23 +292,13 @@ def _programme(
     low, near_full, full = loads_mw
     scale = (full - low) / _PAPER_LOAD_SPAN_MW
     return Programme(
-        load_mean_mw=low + 68.0 * scale,
-        load_daily_mw=32.0 * scale,
-        load_spread_mw=50.0 * scale,
-        load_low_mw=low,
-        load_high_mw=full,
-        full_load_from_mw=near_full,
-        ramp_low_mw_per_min=2.5 * scale,
-        ramp_high_mw_per_min=6.0 * scale,
-        pressure_low_mpa=pressures_mpa[0],
-        pressure_rise_mpa=pressures_mpa[1] - pressures_mpa[0],
-        pressure_span_mw=full - low,
-        pressure_wander_mpa=rng.uniform(0.15, 0.3),
-        temperature_degc=rng.uniform(535.0, 542.0),
-        jitter_percent=rng.uniform(0.2, 0.4),
-        pulse_every_s=rng.uniform(1000.0, 2000.0),
-        feedback=bool(rng.random() < 0.8),
-        feedback_slope_mw=(full - low) / u_span,
-        feedback_limit_u=150.0 * u_span / _PAPER_U_SPAN,
+        load_mean_mw=low + 68.0 * scale, load_daily_mw=32.0 * scale, load_spread_mw=50.0 * scale,
+        load_low_mw=low, load_high_mw=full, full_load_from_mw=near_full,
+        ramp_low_mw_per_min=2.5 * scale, ramp_high_mw_per_min=6.0 * scale,
+        pressure_low_mpa=pressures_mpa[0], pressure_rise_mpa=pressures_mpa[1] - pressures_mpa[0],
+        pressure_span_mw=full - low, pressure_wander_mpa=rng.uniform(0.15, 0.3),
+        temperature_degc=rng.uniform(535.0, 542.0), jitter_percent=rng.uniform(0.2, 0.4),
+        pulse_every_s=rng.uniform(1000.0, 2000.0), feedback=bool(rng.random() < 0.8),
+        feedback_slope_mw=(full - low) / u_span, feedback_limit_u=150.0 * u_span / _PAPER_U_SPAN,
         feedback_off_above_mw=full - 4.5 * scale,
-    )
+    )  # fmt: skip

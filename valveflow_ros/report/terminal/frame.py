@@ -13,22 +13,14 @@ from valveflow_ros.report.words import counted, decimals, duration, moment, sign
 # The numbers of the messages in plain words.
 CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused', 'provisional')
 SAMPLE_STATES = (
-    'no curve yet',
-    'plant in motion',
-    'steady state',
-    'on a long ramp',
-    'outside the curve',
+    'no curve yet', 'plant in motion', 'steady state', 'on a long ramp', 'outside the curve',
     'bad or missing data',
-)
+)  # fmt: skip
 ALARM_STATES = (
-    'normal',
-    'ALARM, not acknowledged',
-    'ALARM, acknowledged',
-    'gone by itself, not acknowledged',
-    'shelved for a time',
-    'cannot be judged now',
+    'normal', 'ALARM, not acknowledged', 'ALARM, acknowledged',
+    'gone by itself, not acknowledged', 'shelved for a time', 'cannot be judged now',
     'out of service',
-)
+)  # fmt: skip
 VERDICTS = ('not diagnosed yet', 'no cause found', 'cause named', 'unexplained')
 NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED = 0, 1, 2
 OUTSIDE, BAD_DATA = 4, 5
