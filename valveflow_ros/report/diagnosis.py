@@ -294,7 +294,7 @@ def _moments(start_ns: int, time_s: FloatArray) -> list[float | None]:
 def _marked(
     x: list[float | None], y: FloatArray, name: str, colour: str, dash: str, hover: str
 ) -> Spec:
-    look = {'dash': dash, 'mode': 'lines+markers', 'marker': {'size': 5}}
+    look: Spec = {'dash': dash, 'mode': 'lines+markers', 'marker': {'size': 5}}
     return plot.line(x, plot.rounded(y, 4), name, colour, hover, **look)
 
 
