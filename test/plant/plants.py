@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
 from step_plan import StepPlan, step_test
@@ -59,3 +60,11 @@ def same(one: SimulatedLog, other: SimulatedLog) -> None:
     np.testing.assert_array_equal(one.table.quality, other.table.quality)
     for name in TRUTHS:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def naive_lag(y: float, x0: float, x1: float, time_s: float, h: float = 1.0) -> float:
+    """Solve T y' + y = x exactly over one step in which x is straight."""
+    if time_s == 0.0:
+        return x1
+    slope = (x1 - x0) / h
+    return x1 - slope * time_s + (y - x0 + slope * time_s) * math.exp(-h / time_s)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import UNITS
+from plants import UNITS, naive_lag
 from step_plan import StepPlan, step_test
 
 from valveflow_ros.plant import loop
@@ -55,14 +55,6 @@ def naive_inverse(unit: UnitDescription, x: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if naive_curve(unit, middle) < x else (low, middle)
     return 0.5 * (low + high)
-
-
-def naive_lag(y: float, x0: float, x1: float, time_s: float, h: float) -> float:
-    """Solve T y' + y = x exactly over one step in which x is straight."""
-    if time_s == 0.0:
-        return x1
-    slope = (x1 - x0) / h
-    return x1 - slope * time_s + (y - x0 + slope * time_s) * math.exp(-h / time_s)
 
 
 def naive_at(history: list[float], index: float, first: float) -> float:

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from plants import naive_lag
 
 from valveflow_ros.plant.thermal_effects import ThermalHooks, thermal_effect
 from valveflow_ros.plant.thermal_loop import Series, TrueRows, law_of, run
@@ -32,12 +33,6 @@ def drives(unit: ThermalUnit, seed: int, faulty: bool) -> Series:
         0.5 * late, one + 0.03 * late, 18.0 + rng.standard_normal(n),
         0.2 * rng.standard_normal(n), 0.2 * rng.standard_normal(n), 0.01 * rng.standard_normal(n),
     )  # fmt: skip
-
-
-def naive_lag(y: float, x0: float, x1: float, time_s: float) -> float:
-    """Solve T y' + y = x exactly over one second in which x is straight."""
-    slope = x1 - x0
-    return x1 - slope * time_s + (y - x0 + slope * time_s) * math.exp(-1.0 / time_s)
 
 
 def naive_hold(y: float, x: float, time_s: float) -> float:
