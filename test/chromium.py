@@ -32,15 +32,7 @@ def _high(fd: int) -> int:
 
 
 class Chromium:
-    """One browser with one page; everything it asks for and complains of is kept.
-
-    Attributes
-    ----------
-    said : list of str
-        Messages of the console, exceptions and what the browser logged.
-    asked : list of str
-        Addresses of what was requested from outside the page.
-    """
+    """One browser with one page; everything it asks for and complains of is kept."""
 
     def __init__(self, path: str, folder: Path) -> None:
         theirs_in, self._out = map(_high, os.pipe())
@@ -58,15 +50,9 @@ class Chromium:
         self._pid = os.posix_spawn(path, words, os.environ, file_actions=actions, setpgroup=0)
         for fd in (theirs_in, theirs_out, log):
             os.close(fd)
-        self._waiting = b''
-        self._number = 0
-        self._session = ''
-        self._events: list[dict[str, Any]] = []
-        self.said: list[str] = []
-        self.asked: list[str] = []
-        self._attach()
-
-    def _attach(self) -> None:
+        self._waiting, self._number, self._session = b'', 0, ''
+        self.said: list[str] = []  # on the console, as an exception or in the log
+        self.asked: list[str] = []  # addresses outside the page
         pages = self.call('Target.getTargets')['targetInfos']
         target = next(t['targetId'] for t in pages if t['type'] == 'page')
         answer = self.call('Target.attachToTarget', targetId=target, flatten=True)
@@ -128,12 +114,9 @@ class Chromium:
         elif what == 'Log.entryAdded':
             self.said.append(about['entry']['text'])
         elif what == 'Network.requestWillBeSent' and about['type'] != 'Document':
-            self._note(about['request']['url'])
-
-    def _note(self, url: str) -> None:
-        # What stands in the page itself goes nowhere.
-        if not url.startswith(('data:', 'blob:')):
-            self.asked.append(url)
+            # What stands in the page itself goes nowhere.
+            url = about['request']['url']
+            self.asked += [] if url.startswith(('data:', 'blob:')) else [url]
 
     def ask(self, script: str) -> Any:
         """Return the value of an expression, waited for where it is a promise."""
@@ -172,11 +155,6 @@ class Chromium:
         """Wait until the browser has painted twice."""
         frame = 'requestAnimationFrame'
         self.ask(f'new Promise((done) => {frame}(() => {frame}(() => done(1))))')
-
-    def picture(self) -> bytes:
-        """Return the whole page as PNG."""
-        shot = self.call('Page.captureScreenshot', format='png', captureBeyondViewport=True)
-        return base64.b64decode(shot['data'])
 
     def paper(self) -> bytes:
         """Return the page as PDF on A4."""

@@ -60,6 +60,8 @@ class StepPlan:
 class _ByHand:
     """The unit under manual control, the power control and the grid's pulses being off."""
 
+    manual = True
+
     def __init__(self, unit: UnitDescription, seed: int, plan: StepPlan, warm_up: int) -> None:
         self._unit = unit
         self._plan = plan
@@ -69,11 +71,6 @@ class _ByHand:
         self._temperature = Wander(
             generator(seed, ChanceSource.TEMPERATURE), usual.temperature_wander_s, h
         )
-
-    @property
-    def manual(self) -> bool:
-        """The opening is set by hand."""
-        return True
 
     def advance(self, first: int, count: int) -> Outside:
         """Return rows ``[first, first + count)``; the load is what the curve gives."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -15,8 +16,8 @@ from valveflow_ros.page.unit import Shown
 EXTRA = ('dash', 'prometheus_client', 'waitress')
 
 
-@pytest.fixture
-def serve() -> Iterator[Callable[..., Any]]:
+@contextmanager
+def servers() -> Iterator[Callable[..., Any]]:
     """Give a function that starts a server on any free port; skip where the extra is absent."""
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
@@ -26,10 +27,23 @@ def serve() -> Iterator[Callable[..., Any]]:
     made = []
 
     def start(shown: Shown, port: int = 0, **more: Any) -> PageServer:
-        server = PageServer(shown, port=port, **more)
-        made.append(server)
-        return server
+        made.append(PageServer(shown, port=port, **more))
+        return made[-1]
 
     yield start
     for server in made:
         server.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Any]]:
+    """Start servers for one test."""
+    with servers() as start:
+        yield start
+
+
+@pytest.fixture(scope='module')
+def serve_long() -> Iterator[Callable[..., Any]]:
+    """Start servers for the tests of a file."""
+    with servers() as start:
+        yield start

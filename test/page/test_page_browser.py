@@ -7,10 +7,9 @@ from __future__ import annotations
 import time
 
 import pytest
-from monitor_recording import START_NS
-from page_units import alarm, head, predict, shown_now, told
+from page_units import alarm, predict, shown_now, told
 
-from valveflow_ros.page.unit import Shown, Unit
+from valveflow_ros.page.unit import Unit
 
 DESKTOP, PHONE = 1280, 390
 LEAST_PX = 13.9
@@ -117,17 +116,6 @@ def test_it_updates_itself_and_stays_where_it_was_scrolled_to(serve, browser, un
     has(browser, 'no monitor')
 
 
-def test_a_unit_that_comes_later_is_shown(serve, browser, unit):
-    shown = Shown()
-    shown.put((), 'Waiting for a monitor.')
-    server = serve(shown)
-    browser.look(DESKTOP)
-    browser.call('Page.navigate', url=server.address)
-    has(browser, 'Waiting for a monitor.')
-    shown.put([unit.snapshot(unit.frame('m'))])
-    has(browser, 'The valve sticks.')
-
-
 def test_it_says_that_nobody_answers_and_goes_on_by_itself(serve, browser, unit):
     server = serve(shown_now(unit))
     browser.look(DESKTOP)
@@ -145,12 +133,8 @@ def test_a_button_asks_the_monitor_for_those_who_know_the_token(serve, browser, 
     from valveflow_ros.page.view import Asking
 
     asked = []
-
-    def ask(key, service):
-        asked.append((key, service))
-        return True, 'Acknowledged: residual.'
-
-    server = serve(shown_now(unit), asking=Asking('the right one', ask))
+    asking = Asking('the right one', lambda *what: asked.append(what) or (True, 'Acknowledged.'))
+    server = serve(shown_now(unit), asking=asking)
     browser.look(PHONE)
     browser.visit(server.address)
     has(browser, 'Acknowledge')
@@ -162,17 +146,6 @@ def test_a_button_asks_the_monitor_for_those_who_know_the_token(serve, browser, 
     browser.call('Input.insertText', text='the right one')
     browser.ask('document.getElementById("token").blur()')
     browser.ask(f'{button}.click()')
-    has(browser, 'Acknowledged: residual.')
+    has(browser, 'Acknowledged.')
     assert asked == [('/valveflow_monitor', 'acknowledge residual')]
     assert 'the right one' not in browser.ask(_TEXT)
-
-
-def test_hours_without_a_sample_are_a_gap(serve, browser):
-    unit = told(seconds=130)
-    for k in range(130):
-        predict(unit, 7200 + k, header=head(START_NS + (7200 + k) * 10**9))
-    server = serve(shown_now(unit))
-    browser.look(DESKTOP)
-    browser.visit(server.address)
-    day = 'document.querySelector(".history .js-plotly-plot")'
-    until(browser, f'{day}.data[3].y.filter(v => v === null).length', 1)

@@ -31,8 +31,8 @@ from valveflow_ros.report.terminal.frame import AlarmView
 PATIENCE_S = 20.0
 
 
-def change(name: str = 'residual', state: int = 1, previous: int | None = 0) -> AlarmChange:
-    view = AlarmView(name, state, 'Nine MW less – look.', START_NS)
+def change(state: int = 1, previous: int | None = 0) -> AlarmChange:
+    view = AlarmView('residual', state, 'Nine MW less – look.', START_NS)
     return AlarmChange('U1', '/m', view, previous, START_NS + 10**9)
 
 
@@ -53,35 +53,22 @@ def test_what_is_sent():
     assert (unknown['state'], unknown['previous_state']) == ('state_99', None)
 
 
-def test_in_order_and_tried_again():
-    came, fails = [], [True, True, False, False]
+def test_in_order_tried_again_given_up_and_counted():
+    came, said, refused = [], [], [True, True, False, True, True, True, False]
 
     def deliver(content):
         came.append(content)
-        if fails.pop(0):
+        if refused.pop(0):
             raise DeliveryError('not now')
 
-    said = []
     sender = Sender(deliver, pauses_s=(0.0, 0.0), complain=said.append)
-    sender.put(b'1')
-    sender.put(b'2')
+    for content in (b'1', b'2', b'3'):
+        sender.put(content)
     until(lambda: sender.sent == 2)
     sender.close()
-    assert came == [b'1', b'1', b'1', b'2']
-    assert len(said) == 2
-    assert 'not now' in said[0]
-
-
-def test_given_up_and_counted():
-    def deliver(_):
-        raise DeliveryError('never')
-
-    said = []
-    sender = Sender(deliver, pauses_s=(0.0,), complain=said.append)
-    sender.put(b'1')
-    until(lambda: sender.failed == 1)
-    sender.close()
-    assert 'given up' in said[-1]
+    assert came == [b'1'] * 3 + [b'2'] * 3 + [b'3']
+    assert sender.failed == 1
+    assert [('not now' in s, 'given up' in s) for s in said] == [(True, k == 4) for k in range(5)]
 
 
 def test_while_one_hangs_the_oldest_that_wait_are_dropped_and_nobody_waits():
@@ -107,11 +94,10 @@ def test_while_one_hangs_the_oldest_that_wait_are_dropped_and_nobody_waits():
 
 
 def test_closing_does_not_wait_for_the_next_try():
-    def deliver(_):
-        raise DeliveryError('no')
-
-    sender = Sender(deliver, pauses_s=(3600.0,))
+    said = []
+    sender = Sender(command('false'), pauses_s=(3600.0,), complain=said.append)
     sender.put(b'1')
+    until(lambda: said)
     begun_s = time.monotonic()
     sender.close(1.0)
     assert time.monotonic() - begun_s < 5.0
@@ -122,22 +108,6 @@ def test_a_command_gets_the_notice(tmp_path):
     code = 'import sys; open(sys.argv[1], "wb").write(sys.stdin.buffer.read())'
     command(f"{sys.executable} -c '{code}' '{file}'")(notice(change()))
     assert json.loads(file.read_bytes())['alarm'] == 'residual'
-
-
-@pytest.mark.parametrize(
-    ('line', 'told'),
-    [
-        ('false', 'ended with status 1'),
-        ('/no/such/program', 'No such file'),
-        # A shell and what it starts are both ended.
-        ("sh -c 'sleep 600 & wait'", 'longer than 0.3 s'),
-    ],
-)
-def test_a_command_that_fails_is_told(line, told):
-    begun_s = time.monotonic()
-    with pytest.raises(DeliveryError, match=told):
-        command(line, limit_s=0.3)(b'{}')
-    assert time.monotonic() - begun_s < PATIENCE_S
 
 
 class Answering(BaseHTTPRequestHandler):
@@ -156,7 +126,7 @@ class Answering(BaseHTTPRequestHandler):
 def hook():
     server = ThreadingHTTPServer(('127.0.0.1', 0), Answering)
     server.came, server.statuses = [], []
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()
     yield server
     server.shutdown()
@@ -202,25 +172,38 @@ def test_a_webhook_that_hangs_is_left(drip):
         thread.join()
 
 
-def test_nobody_there_is_told():
+@pytest.mark.parametrize(
+    ('line', 'told'),
+    [
+        ('false', 'ended with status 1'),
+        ('/no/such/program', 'No such file'),
+        # A shell and what it starts are both ended.
+        ("sh -c 'sleep 600 & wait'", 'longer than 0.3 s'),
+        (None, 'refused'),
+    ],
+)
+def test_what_cannot_be_delivered_is_told(line, told):
     with socket.create_server(('127.0.0.1', 0)) as free:
         port = free.getsockname()[1]
-    with pytest.raises(DeliveryError, match='refused'):
-        webhook(f'http://127.0.0.1:{port}/')(b'{}')
+    deliver = command(line, limit_s=0.3) if line else webhook(f'http://127.0.0.1:{port}/')
+    begun_s = time.monotonic()
+    with pytest.raises(DeliveryError, match=told):
+        deliver(b'{}')
+    assert time.monotonic() - begun_s < PATIENCE_S
 
 
 @pytest.mark.parametrize(
-    'url', ['', 'host', 'ftp://host/', 'http://', 'http://[1', 'http://a:99999/', 'http://u:p@h/']
-)
-def test_what_is_no_address_is_refused(url):
-    with pytest.raises(UsageError, match='--webhook must be an address'):
-        webhook(url)
-
-
-@pytest.mark.parametrize('line', ['', '  ', "an 'open quote"])
-def test_what_is_no_command_is_refused(line):
-    with pytest.raises(UsageError, match='--on-alarm'):
-        command(line)
+    ('make', 'text'),
+    [
+        *((webhook, url) for url in ('', 'host', 'ftp://host/', 'http://', 'http://[1',
+                                     'http://a:99999/', 'http://u:p@h/')),
+        *((command, line) for line in ('', '  ', "an 'open quote")),
+    ],
+)  # fmt: skip
+def test_what_is_no_address_and_no_command_is_refused(make, text):
+    said = '--on-alarm' if make is command else '--webhook must be an address'
+    with pytest.raises(UsageError, match=said):
+        make(text)
 
 
 def test_changes_of_a_unit_reach_the_webhook(hook):

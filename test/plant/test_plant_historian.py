@@ -4,34 +4,29 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from valveflow_ros.errors import InputError
 from valveflow_ros.plant.historian import SPANS, Historian, exceptions
 
 START_NS = 1_700_006_400_000_000_000
 NAMES = ('valve_opening_percent', 'main_steam_pressure_mpa', 'generated_power_mw')
 
 
-def signals(seconds: int = 7300) -> dict[str, np.ndarray]:
+def signals() -> dict[str, np.ndarray]:
     """Return walks of the size of plant signals."""
     rng = np.random.default_rng(2)
     sizes = dict(zip(NAMES, (0.1, 0.02, 0.4), strict=True))
     return {
-        name: 100.0 + size * np.cumsum(rng.standard_normal(seconds))
-        for name, size in sizes.items()
+        name: 100.0 + size * np.cumsum(rng.standard_normal(7300)) for name, size in sizes.items()
     }
 
 
-def record(historian: Historian, seed: int = 1, seconds: int = 7300):
+def record(historian: Historian):
     """Record the walks."""
-    rng = np.random.default_rng(seed)
-    return historian.record(START_NS, signals(seconds), rng)
+    return historian.record(START_NS, signals(), np.random.default_rng(1))
 
 
 def naive_exceptions(
@@ -86,7 +81,7 @@ def test_a_minute_is_the_plain_mean_stamped_at_its_end() -> None:
             assert time_ns[k] == START_NS + (k + 1) * 60_000_000_000
 
 
-@pytest.mark.parametrize('band', [0.1, 0.5, 2.0])
+@pytest.mark.parametrize('band', [0.1, 2.0])
 def test_a_scanned_value_lies_within_the_band_of_the_last_one_kept(band: float) -> None:
     historian = Historian('compressed', band_percent=band)
     time_ns, columns = record(historian)
@@ -110,11 +105,10 @@ def test_a_scanned_value_lies_within_the_band_of_the_last_one_kept(band: float) 
 
 
 def test_a_wider_band_keeps_less() -> None:
-    sizes = [
-        int(np.isfinite(record(Historian('compressed', band_percent=b))[1][NAMES[2]]).sum())
-        for b in (0.1, 0.5, 2.0)
-    ]
+    found = [record(Historian('compressed', band_percent=b))[1] for b in (0.1, 0.5, 2.0)]
+    sizes = [np.isfinite(columns[NAMES[2]]).sum() for columns in found]
     assert sizes[0] > sizes[1] > sizes[2] >= 7300 // 600
+    assert np.all(np.any([np.isfinite(c) for c in found[1].values()], axis=0)), 'no empty row'
 
 
 @pytest.mark.parametrize('step', [5, 60])
@@ -126,12 +120,6 @@ def test_resampled_rows_hold_the_last_value_kept(step: int) -> None:
         here = np.isfinite(own[name])
         places = np.searchsorted(own_ns[here], time_ns, side='right') - 1
         np.testing.assert_array_equal(columns[name], own[name][here][places])
-
-
-def test_the_rows_of_values_with_own_times_hold_at_least_one() -> None:
-    time_ns, columns = record(Historian('compressed'))
-    assert np.all(np.diff(time_ns) > 0)
-    assert np.all(np.any([np.isfinite(column) for column in columns.values()], axis=0))
 
 
 def test_dropouts_take_values_away_and_change_none() -> None:
@@ -158,40 +146,8 @@ def test_after_a_dropout_the_first_scan_is_kept() -> None:
     assert kept.tolist() == [3, 203]
 
 
-@pytest.mark.parametrize('text', ['1s', 'minute', 'compressed:resample_s=5'])
-def test_the_same_seed_gives_the_same_record(text: str) -> None:
-    made = [record(Historian.parse(text), seed) for seed in (1, 1)]
-    assert made[0][0].tobytes() == made[1][0].tobytes()
-    for name in NAMES:
-        assert made[0][1][name].tobytes() == made[1][1][name].tobytes()
-
-
 def test_a_historian_is_read_from_its_text() -> None:
     assert Historian.parse('minute') == Historian('minute')
     assert Historian.parse(' compressed: band_percent=1, longest_s=300') == Historian(
         'compressed', band_percent=1.0, longest_s=300.0
     )
-
-
-@pytest.mark.parametrize(
-    ('text', 'words'),
-    [
-        ('', r"no recording '': use one of 1s, minute, compressed\.$"),
-        ('hourly', "no recording 'hourly'"),
-        ('compressed:band=1', "Recording 'compressed' has no option 'band': it has band_percent"),
-        ('compressed:band_percent=x', "band_percent must be a number, not 'x'"),
-        ('compressed:band_percent=nan', 'finite'),
-        ('compressed:band_percent=-1', 'band_percent must be 0 to 50'),
-        ('compressed:scan_low_s=40', 'scans must be'),
-        ('compressed:longest_s=20', 'longest_s must not be below scan_high_s'),
-        ('compressed:resample_s=1.5', 'whole seconds'),
-        ('minute:resample_s=60', "belongs to the recording 'compressed'"),
-        ('1s:dropouts_per_day=1000', 'dropouts_per_day must be 0 to 100'),
-        ('1s:dropout_minutes=0', 'dropout_minutes'),
-    ],
-)
-def test_nonsense_gets_one_sentence(text: str, words: str) -> None:
-    with pytest.raises(InputError) as caught:
-        Historian.parse(text)
-    assert re.search(words, str(caught.value)), caught.value
-    assert str(caught.value).endswith('.')

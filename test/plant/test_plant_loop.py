@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The slow truth of the closed loop: plain Python, no arrays, no state between parts."""
+"""The closed loop against plain Python without arrays; the actuator by its laws."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from plants import UNITS, naive_lag
+from step_plan import StepPlan, step_test
 
-from valveflow_ros.plant.effect import DAY_S
+from valveflow_ros.plant import loop
+from valveflow_ros.plant.effect import DAY_S, ActuatorLimits
 from valveflow_ros.plant.loop import lag_coefficients
 from valveflow_ros.plant.plant import Disturbance, LoadProgramme
 from valveflow_ros.plant.simulator import WARM_UP_S, simulate
@@ -50,14 +55,6 @@ def naive_inverse(unit: UnitDescription, x: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if naive_curve(unit, middle) < x else (low, middle)
     return 0.5 * (low + high)
-
-
-def naive_lag(y: float, x0: float, x1: float, time_s: float, h: float) -> float:
-    """Solve T y' + y = x exactly over one step in which x is straight."""
-    if time_s == 0.0:
-        return x1
-    slope = (x1 - x0) / h
-    return x1 - slope * time_s + (y - x0 + slope * time_s) * math.exp(-h / time_s)
 
 
 def naive_at(history: list[float], index: float, first: float) -> float:
@@ -142,7 +139,7 @@ EVERYTHING = Faults(0.6, 1.0, 0.7, 0.12, 84.0, 0.0, 0.3, 20.0)
 EVERYTHING_SPECS = ('backlash', 'stiction', 'rate_limit', 'saturation', 'reheater')
 
 
-@pytest.mark.parametrize('number', [None, 0, 1, 2, 3])
+@pytest.mark.parametrize('number', [None, 1, 3])
 @pytest.mark.parametrize('faulty', [False, True])
 def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None:
     rng = np.random.default_rng(number)
@@ -154,16 +151,16 @@ def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None
     faults = dataclasses.replace(EVERYTHING, kappa=kappa) if faulty else Faults()
     effects = [EffectSpec.parse(name) for name in EVERYTHING_SPECS] if faulty else []
     effects += [EffectSpec.of('choked', kappa=kappa)] if faulty else []
-    log = simulate(0.07, seed=5, unit=unit, effects=effects)
-    slow = naive_plant(unit, 0.07, 5, faults)
+    log = simulate(0.03, seed=5, unit=unit, effects=effects)
+    slow = naive_plant(unit, 0.03, 5, faults)
     np.testing.assert_allclose(log.table.values[:, 4], np.round(slow[:, 0], 2), atol=0.0101)
     np.testing.assert_allclose(log.plug_percent, slow[:, 1], rtol=1e-9)
     np.testing.assert_allclose(log.true_u, slow[:, 2], rtol=1e-9)
     np.testing.assert_allclose(log.true_power_mw, slow[:, 3], rtol=1e-9)
 
 
-@pytest.mark.parametrize('step_s', [0.5, 1.0, 2.0, 7.0])
-@pytest.mark.parametrize('time_s', [0.5, 10.0, 80.0])
+@pytest.mark.parametrize('step_s', [0.5, 1.0, 7.0])
+@pytest.mark.parametrize('time_s', [0.5, 80.0])
 def test_a_ramp_is_answered_late_by_its_time_constant(step_s: float, time_s: float) -> None:
     a, b, c = lag_coefficients(time_s, step_s)
     ramp = np.arange(0.0, 20.0 * time_s + 10.0 * step_s, step_s)
@@ -173,22 +170,58 @@ def test_a_ramp_is_answered_late_by_its_time_constant(step_s: float, time_s: flo
     assert y == pytest.approx(ramp[-1] - time_s, rel=1e-6, abs=1e-6 * time_s)
 
 
-def test_a_lag_without_time_constant_lets_everything_through() -> None:
-    assert lag_coefficients(0.0, 1.0) == (0.0, 0.0, 1.0)
-
-
-def test_sampling_twice_as_often_gives_the_same_plant(quiet: UnitDescription) -> None:
+def test_sampling_twice_as_often_gives_the_same_plant() -> None:
     # Noise would differ from rate to rate; a manual step test has none here.
-    from step_plan import StepPlan, step_test
-
     plan = StepPlan(pressure_wander_mpa=0.0, steps=4, hold_s=600.0)
-    regions = (Region(np.inf, 30.0, 4.0),)
-    powers = []
-    for h in (1.0, 2.0):
-        unit = UnitDescription(
-            regions=regions, noise=quiet.noise, programme=quiet.programme, sample_period_s=h
-        )
-        powers.append(step_test(1, plan, unit).true_power_mw)
+    one, two = (
+        step_test(1, plan, dataclasses.replace(
+            UNITS['quiet'], regions=(Region(np.inf, 30.0, 4.0),), sample_period_s=h
+        )).true_power_mw
+        for h in (1.0, 2.0)
+    )  # fmt: skip
     # Straight between samples is exact but for the corners of the moves.
-    np.testing.assert_allclose(powers[0][::2], powers[1], atol=0.4)
-    assert np.abs(powers[0][::2] - powers[1]).mean() < 0.02
+    np.testing.assert_allclose(one[::2], two, atol=0.4)
+    assert np.abs(one[::2] - two).mean() < 0.02
+
+
+# The operators of the actuator.
+
+paths = st.lists(st.floats(0.0, 100.0, width=32), min_size=1, max_size=60)
+widths = st.floats(0.0, 5.0, width=32)
+
+
+def through(path: list[float], step_s: float = 1.0, **limits: float) -> np.ndarray:
+    """Send a path through a bank that rests at its first value."""
+    settings = loop.settings(ActuatorLimits(**limits), step_s)
+    positions = np.full(loop.N_POSITIONS, path[0])
+    return np.array([loop.move(v, positions, settings) for v in path])
+
+
+@given(paths, widths, st.integers(2, 5))
+def test_play_stays_within_half_its_width_at_any_speed(
+    path: list[float], width: float, times: int
+) -> None:
+    fast = through(path, slack_percent=width)
+    assert np.all(np.abs(fast - path) <= width / 2 + 1e-9)
+    # Straight between its points and slower by a factor: the same at the points.
+    slow = np.interp(np.arange((len(path) - 1) * times + 1) / times, np.arange(len(path)), path)
+    np.testing.assert_allclose(through(slow, slack_percent=width)[::times], fast, atol=1e-9)
+    # Stick-slip without a jump is play.
+    np.testing.assert_allclose(through(path, band_percent=width), fast, atol=1e-9)
+
+
+@given(paths, widths, st.floats(0.0, 1.0))
+def test_a_sticking_valve_stays_or_jumps(path: list[float], band: float, share: float) -> None:
+    jump = share * band
+    position = through(path, band_percent=band, jump_percent=jump)
+    moves = np.abs(np.diff(position))
+    assert np.all((moves == 0.0) | (moves >= jump - 1e-9))
+    assert np.all(np.abs(position - path) <= (band + jump) / 2 + 1e-9)
+
+
+@given(paths, st.floats(0.1, 10.0), st.sampled_from([0.5, 2.0]), st.floats(1.0, 100.0))
+def test_rate_and_stop_are_kept(path: list[float], rate: float, step_s: float, top: float) -> None:
+    position = through([*path, *[50.0] * 2_000], step_s, rate_percent_per_s=rate)
+    assert np.all(np.abs(np.diff(position)) <= rate * step_s + 1e-9)
+    assert position[-1] == 50.0, 'it ends where it is sent if it is given the time'
+    np.testing.assert_array_equal(through(path, top_percent=top)[1:], np.minimum(path, top)[1:])

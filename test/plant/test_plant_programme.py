@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plants import run, same
 
 from valveflow_ros.plant.effect import DAY_S
 from valveflow_ros.plant.plant import LoadProgramme, Pulses, load_knots
@@ -22,22 +23,8 @@ def days() -> SimulatedLog:
     return simulate(4.0, seed=20)
 
 
-@pytest.fixture(scope='module')
-def knots() -> tuple[np.ndarray, np.ndarray]:
-    return load_knots(np.random.default_rng(1), LONG_S, 0.0, Programme())
-
-
-def same(one: SimulatedLog, other: SimulatedLog) -> None:
-    """Assert that two logs are equal bit for bit."""
-    np.testing.assert_array_equal(one.table.time_ns, other.table.time_ns)
-    np.testing.assert_array_equal(one.table.values, other.table.values)
-    np.testing.assert_array_equal(one.table.quality, other.table.quality)
-    for name in ('true_u', 'true_power_mw', 'load_mw', 'noise_mw', 'plug_percent'):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_holds_and_ramps_of_the_load(knots: tuple[np.ndarray, np.ndarray]) -> None:
-    seconds, load = knots
+def test_holds_and_ramps_of_the_load() -> None:
+    seconds, load = load_knots(np.random.default_rng(1), LONG_S, 0.0, Programme())
     holds, ramps = np.diff(seconds)[0::2], np.diff(seconds)[1::2]
     targets, moves = load[2::2], np.abs(np.diff(load)[1::2])
     assert np.all(np.diff(load)[0::2] == 0.0)
@@ -52,11 +39,9 @@ def test_holds_and_ramps_of_the_load(knots: tuple[np.ndarray, np.ndarray]) -> No
     assert 0.15 < np.mean(targets >= 286.0) < 0.21
 
 
-@pytest.mark.parametrize('clock_h', [0.0, 7.0])
-def test_the_load_follows_the_clock(clock_h: float) -> None:
-    seconds, load = load_knots(
-        np.random.default_rng(2), LONG_S, clock_h * 3600.0, Programme(full_load_share=0.0)
-    )
+def test_the_load_follows_the_clock() -> None:
+    plan, clock_h = Programme(full_load_share=0.0), 7.0
+    seconds, load = load_knots(np.random.default_rng(2), LONG_S, clock_h * 3600.0, plan)
     t = np.arange(0.0, LONG_S, 600.0)
     phase = 2.0 * np.pi * ((t / 3600.0 + clock_h) - 9.0) / 24.0
     wave = np.interp(t, seconds, load)
@@ -85,9 +70,6 @@ def test_pulses_of_primary_frequency_control() -> None:
     assert np.mean(pulses.height_percent > 0.0) == pytest.approx(0.5, abs=0.03)
     assert 30.0 <= pulses.hold_s.min() < 31.0
     assert 119.0 < pulses.hold_s.max() <= 120.0
-
-
-def test_a_pulse_is_a_trapezoid() -> None:
     pulse = Pulses(np.array([10.0]), np.array([20.0]), np.array([-2.0]))
     shown = pulse.at(np.array([9.0, 10.0, 12.0, 14.0, 20.0, 34.0, 36.0, 38.0, 39.0]))
     np.testing.assert_allclose(shown, [0, 0, -1, -2, -2, -2, -1, 0, 0])
@@ -96,6 +78,7 @@ def test_a_pulse_is_a_trapezoid() -> None:
 def test_ranges_of_the_paper_unit(days: SimulatedLog) -> None:
     values = days.table.values
     opening, pressure, temperature, power, _ = values.T
+    np.testing.assert_allclose(opening * pressure**1.125, days.true_u, rtol=0.01)
     assert 990.0 < days.true_u.min() < 1100.0
     assert 2200.0 < days.true_u.max() < 2400.0
     assert 135.0 < power.min() < 155.0
@@ -134,13 +117,8 @@ def test_noise_and_rounding_of_the_sensors(days: SimulatedLog) -> None:
         assert np.diff(values[:, signal]).std() == pytest.approx(np.sqrt(2) * sigma, rel=0.4)
 
 
-def test_true_input_is_opening_times_a_power_of_the_pressure(days: SimulatedLog) -> None:
-    opening, pressure = days.table.values[:, 0], days.table.values[:, 1]
-    np.testing.assert_allclose(opening * pressure**1.125, days.true_u, rtol=0.01)
-
-
 def test_the_record_begins_in_equilibrium() -> None:
-    starts = [simulate(0.02, seed) for seed in range(40)]
+    starts = [simulate(0.02, seed) for seed in range(20)]
     error = [np.mean(s.true_power_mw[:60] - s.load_mw[:60]) for s in starts]
     assert np.std(error) < 4.0
     assert abs(np.mean(error)) < 1.5
@@ -165,43 +143,33 @@ def test_temperature_and_pressure_correlate_as_asked(wanted: float) -> None:
         temperature_pressure_correlation=wanted, load_daily_mw=0.0, load_spread_mw=0.1,
         full_load_share=0.0,
     )  # fmt: skip
-    found = []
-    for seed in range(3):
-        # Both wander slowly; a coarse step shows it as well.
-        log = simulate(6.0, seed, UnitDescription(programme=plan, sample_period_s=10.0))
-        found.append(np.corrcoef(log.table.values[:, 1], log.table.values[:, 2])[0, 1])
-    assert np.mean(found) == pytest.approx(wanted, abs=0.12)
+    # Both wander slowly; a coarse step shows it as well.
+    log = simulate(18.0, 0, UnitDescription(programme=plan, sample_period_s=20.0))
+    _, pressure, temperature, *_ = log.table.values.T
+    assert np.corrcoef(pressure, temperature)[0, 1] == pytest.approx(wanted, abs=0.12)
 
 
-def test_load_dependent_noise_grows_with_the_load() -> None:
-    log = simulate(0.3, 6, UnitDescription(noise=Noise(load_dependence=0.8)))
-    base = simulate(0.3, 6)
-    share = log.noise_mw / base.noise_mw
+def test_noise_by_load_and_a_slow_wander_change_the_noise_alone() -> None:
+    base = run(days=0.3)
+    log = simulate(0.3, 1, UnitDescription(noise=Noise(load_dependence=0.8)))
     expected = 1.0 + 0.8 * (log.load_mw - 228.0) / (293.5 - 228.0)
-    np.testing.assert_allclose(share, expected, rtol=1e-9)
-
-
-def test_a_slow_wander_adds_noise_and_nothing_else() -> None:
-    log = simulate(0.5, 7, UnitDescription(noise=Noise(wander_mw=0.6)))
-    added = log.noise_mw - simulate(0.5, 7).noise_mw
-    assert 0.2 < added.std() < 1.2
+    np.testing.assert_allclose(log.noise_mw / base.noise_mw, expected, rtol=1e-9)
+    added = simulate(0.3, 1, UnitDescription(noise=Noise(wander_mw=0.6))).noise_mw - base.noise_mw
+    assert 0.1 < added.std() < 1.2
     assert np.mean(added[600:] * added[:-600]) / np.mean(added**2) > 0.8
 
 
-def test_the_seed_decides_everything() -> None:
-    same(simulate(0.1, 8), simulate(0.1, 8))
-    assert not np.array_equal(simulate(0.1, 8).noise_mw, simulate(0.1, 9).noise_mw)
-
-
-def test_a_longer_run_begins_with_the_shorter_one() -> None:
-    effects = [EffectSpec.parse(t) for t in ('clock:d_s=2.5', 'spikes:per_day=300', 'diurnal')]
-    short, long = (simulate(days, 8, effects=effects) for days in (0.1, 0.2))
+def test_the_seed_decides_everything_and_a_longer_run_begins_with_the_shorter_one() -> None:
+    effects = ('clock:d_s=2.5', 'spikes:per_day=300', 'diurnal')
+    short, long = (run(*effects, days=days, seed=8) for days in (0.1, 0.2))
     n = len(short)
+    same(short, simulate(0.1, 8, effects=short.active))
     np.testing.assert_array_equal(short.table.values, long.table.values[:n])
     np.testing.assert_array_equal(short.true_u, long.true_u[:n])
+    assert not np.array_equal(short.noise_mw, run(*effects, days=0.1, seed=9).noise_mw)
 
 
-@pytest.mark.parametrize('part_s', [61.0, 3600.0, 5000.0, np.inf])
+@pytest.mark.parametrize('part_s', [61.0, 5000.0, np.inf])
 @pytest.mark.parametrize('lead', ['7.5', '-7.5'])
 def test_any_cutting_into_parts_gives_the_same_run(part_s: float, lead: str) -> None:
     texts = (
@@ -209,18 +177,13 @@ def test_any_cutting_into_parts_gives_the_same_run(part_s: float, lead: str) -> 
         'stiction:before_sensor=1', 'rate_limit', 'reheater', 'curve_step:t0_days=0.03',
         'temperature', 'spikes:per_day=500,signal=main_steam_pressure', 'choked',
     )  # fmt: skip
-    effects = [EffectSpec.parse(text) for text in texts]
-    parts = list(simulate_parts(0.1, 3, effects=effects, part_s=part_s))
+    whole = run(*texts, days=0.1, seed=3)
+    parts = list(simulate_parts(0.1, 3, effects=whole.active, part_s=part_s))
     assert all(len(part) <= max(part_s, 61.0) for part in parts)
-    same(SimulatedLog.joined(parts), simulate(0.1, 3, effects=effects))
+    same(SimulatedLog.joined(parts), whole)
 
 
 def test_stamps_follow_the_sample_period() -> None:
-    unit = UnitDescription(sample_period_s=2.0)
-    log = simulate(0.01, 1, unit, start_ns=5 * NS_PER_S)
-    assert len(log) == 432
+    log = simulate(0.01, 1, UnitDescription(sample_period_s=2.0), start_ns=5 * NS_PER_S)
     np.testing.assert_array_equal(log.table.time_ns, (5 + 2 * np.arange(432)) * NS_PER_S)
-
-
-def test_default_start_is_a_midnight() -> None:
-    assert DEFAULT_START_NS % int(DAY_S * NS_PER_S) == 0
+    assert DEFAULT_START_NS % int(DAY_S * NS_PER_S) == 0, 'a midnight'

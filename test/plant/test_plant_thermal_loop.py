@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from plants import naive_lag
 
 from valveflow_ros.plant.thermal_effects import ThermalHooks, thermal_effect
 from valveflow_ros.plant.thermal_loop import Series, TrueRows, law_of, run
@@ -34,19 +35,12 @@ def drives(unit: ThermalUnit, seed: int, faulty: bool) -> Series:
     )  # fmt: skip
 
 
-def naive_lag(y: float, x0: float, x1: float, time_s: float) -> float:
-    """Solve T y' + y = x exactly over one second in which x is straight."""
-    slope = x1 - x0
-    return x1 - slope * time_s + (y - x0 + slope * time_s) * math.exp(-1.0 / time_s)
-
-
 def naive_hold(y: float, x: float, time_s: float) -> float:
     """Solve T y' + y = x exactly over one second in which x is held."""
     return x + (y - x) * math.exp(-1.0 / time_s)
 
 
 def naive_kpa(degc: float) -> float:
-    """Return the saturation pressure of water."""
     return 0.61094 * math.exp(17.625 * degc / (degc + 243.04))
 
 
@@ -170,24 +164,22 @@ def test_the_fast_loop_is_the_slow_one(kind: str, faulty: bool) -> None:
     assert np.ptp(out[2]) > 5.0, 'the valve has to move for this to say something'
 
 
-@pytest.mark.parametrize('kind', ['choked', 'choked_fixed', 'sequence', 'integrated_input'])
-def test_a_unit_left_alone_comes_to_rest_on_its_static_power(kind: str) -> None:
+@pytest.mark.parametrize('kind', ['choked_fixed', 'sequence', 'integrated_input'])
+@pytest.mark.parametrize('load', [160.0, 300.0])
+def test_a_unit_left_alone_comes_to_rest_on_its_static_power(kind: str, load: float) -> None:
     unit = dataclasses.replace(random_unit(kind, 3), vacuum_per_kpa=0.0)
     n = 4 * 3600
-    for load in (160.0, 240.0, 300.0):
-        rest, one = np.zeros(n), np.ones(n)
-        pressure = unit.pressure_set_mpa(np.full(n, load))
-        series = Series(
-            np.full(n, load), rest, pressure, rest, one, rest, one, rest, one,
-            np.full(n, unit.water_degc), rest, rest, rest,
-        )  # fmt: skip
-        out = np.empty((len(TrueRows._fields), n))
-        run(series, law_of(unit, ThermalHooks.for_run(float(n))), out)
-        last = TrueRows(*out[:, -1])
-        assert last.power == pytest.approx(load, abs=1e-3)
-        assert last.power == pytest.approx(
-            float(unit.static_power(last.plug, last.pressure)), abs=1e-3
-        )
-        assert last.pressure == pytest.approx(pressure[-1], abs=1e-3)
-        assert last.heat == pytest.approx(last.flow, abs=1e-4)
-        assert last.stem == last.plug
+    rest, one = np.zeros(n), np.ones(n)
+    pressure = unit.pressure_set_mpa(np.full(n, load))
+    series = Series(
+        np.full(n, load), rest, pressure, rest, one, rest, one, rest, one,
+        np.full(n, unit.water_degc), rest, rest, rest,
+    )  # fmt: skip
+    out = np.empty((len(TrueRows._fields), n))
+    run(series, law_of(unit, ThermalHooks.for_run(float(n))), out)
+    last = TrueRows(*out[:, -1])
+    static = float(unit.static_power(last.plug, last.pressure))
+    assert (load, static) == pytest.approx((last.power, last.power), abs=1e-3)
+    assert last.pressure == pytest.approx(pressure[-1], abs=1e-3)
+    assert last.heat == pytest.approx(last.flow, abs=1e-4)
+    assert last.stem == last.plug

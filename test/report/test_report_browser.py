@@ -25,13 +25,11 @@ LEAST_PX = 14.0
 
 def made_pages(identified):
     """Every kind of picture: an identification with a history, a reference, holes; a diagnosis."""
-    table = identified.table
-    values = table.values.copy()
+    values = identified.table.values.copy()
     values[1000:3000, 2] = float('nan')
-    data = replace(
-        identified, table=replace(table, values=values), reference=identified.characteristic,
-        history=history(),
-    )  # fmt: skip
+    table = replace(identified.table, values=values)
+    known = {'reference': identified.characteristic, 'history': history()}
+    data = replace(identified, table=table, **known)
     return {'identify': identification_page(data), 'diagnose': diagnosis_page(diagnosed())}
 
 
@@ -86,11 +84,6 @@ def seen(browser, path, width, *, dark=False):
     return browser
 
 
-def met(browser):
-    """Return what the browser complained of and asked for."""
-    return [*browser.said, *browser.asked]
-
-
 def looked_at(browser, path, pdf):
     """Open a page in a light window and on a dark telephone, and return what was seen."""
     seen(browser, path, DESKTOP)
@@ -100,19 +93,19 @@ def looked_at(browser, path, pdf):
         'buttons': browser.ask(
             "[...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)"
         ),
-        'light': browser.ask(_COLOURS), 'met': met(browser),
+        'light': browser.ask(_COLOURS), 'met': browser.said + browser.asked,
     }  # fmt: skip
     seen(browser, path, PHONE, dark=True)
     found |= {
         'scroll': browser.ask('document.documentElement.scrollWidth'),
         'wide': browser.ask(_WIDE), 'small': browser.ask(_SMALL % LEAST_PX),
-        'phone': json.loads(browser.ask(_DRAWN)), 'met_on_phone': met(browser),
+        'phone': json.loads(browser.ask(_DRAWN)), 'dark': browser.ask(_COLOURS),
+        'met_on_phone': browser.said + browser.asked,
     }  # fmt: skip
-    found['dark'] = browser.ask(_COLOURS)
     browser.ask(_LISTEN)
     pdf.write_bytes(browser.paper())
-    found |= {'printed': browser.ask('window.atPrint'), 'pdf': pdf, 'met_on_paper': met(browser)}
-    return found
+    printed = browser.ask('window.atPrint')
+    return found | {'printed': printed, 'pdf': pdf, 'met_on_paper': browser.said + browser.asked}
 
 
 @pytest.fixture(scope='module')
@@ -139,16 +132,12 @@ def page(request, browser, pages, tmp_path_factory):
     return content, looked_at(browser, path, tmp_path_factory.mktemp('pdf') / 'page.pdf')
 
 
-def test_every_picture_is_drawn_and_nothing_is_asked_for(page):
+def test_every_picture_is_drawn_with_its_numbers_and_nothing_is_asked_for(page):
     content, found = page
     assert [d['name'] for d in found['drawn']] == [f.name for f in content.figures]
     assert all(d['width'] > 600 and d['parts'] for d in found['drawn'])
     assert found['waiting'] == 0
     assert found['met'] == found['met_on_phone'] == found['met_on_paper'] == []
-
-
-def test_numbers_in_the_drawn_page_are_those_of_the_pictures(page):
-    content, found = page
     for figure, drawn in zip(content.figures, found['drawn'], strict=True):
         given = [t.get('y') for t in json.loads(figure.to_json())['data']]
         assert drawn['y'] == [y if isinstance(y, list) else None for y in given], figure.name
@@ -160,15 +149,12 @@ def test_no_button_sends_the_data_anywhere(page):
     assert not [t for t in titles if re.search(r'cloud|studio|share|link', t, re.IGNORECASE)]
 
 
-def test_a_telephone_needs_no_scrolling_to_the_side(page):
+def test_a_telephone_needs_no_scrolling_to_the_side_and_no_glasses(page):
     found = page[1]
+    assert found['small'] == []
     assert found['scroll'] <= PHONE
     assert found['wide'] == []
     assert all(0.8 * PHONE < d['width'] <= PHONE for d in found['phone'])
-
-
-def test_text_on_a_telephone_can_be_read(page):
-    assert page[1]['small'] == []
 
 
 def test_light_and_dark_differ_and_can_both_be_read(page):
@@ -251,10 +237,8 @@ def test_a_point_of_a_judgement_tells_its_value_and_unit(browser, pages, verb):
 
 
 def test_every_line_that_can_be_pointed_at_has_a_unit(pages):
-    for verb, (content, _) in pages.items():
-        for figure in content.figures:
-            for trace in figure.traces:
-                if trace.get('hoverinfo') != 'skip' and verb in ('compare', 'validate'):
-                    assert re.search(r'MW|J|%', trace.get('hovertemplate', '')), (
-                        figure.name, trace['name'],
-                    )  # fmt: skip
+    judged = [pages[verb][0] for verb in ('compare', 'validate') if verb in pages]
+    for figure in (figure for content in judged for figure in content.figures):
+        for trace in figure.traces:
+            if trace.get('hoverinfo') != 'skip':
+                assert re.search(r'MW|J|%', trace.get('hovertemplate', '')), figure.name

@@ -18,53 +18,34 @@ from valveflow_ros.report.figure import plain_text
 from valveflow_ros.report.words import decimals, held_words
 
 
-@pytest.fixture(scope='module')
-def page():
-    return diagnosis_page(diagnosed())
-
-
-def test_the_answer_names_the_cause_its_rival_and_the_experiment(page):
-    d = diagnosis()
-    assert page.sections[0].title == 'The answer'
+def test_the_answer_names_the_cause_its_rival_and_the_experiment_then_come_the_steps():
+    page, d = diagnosis_page(diagnosed()), diagnosis()
+    assert [s.title for s in page.sections] == [
+        'The answer', '1. What is wrong', '2. Why', '3. The extended model',
+        '4. Check on held-out data', 'How the curve moved', 'What the monitor said',
+    ]  # fmt: skip
     first = ' '.join(p for p in page.sections[0].parts if isinstance(p, str))
-    for part in (d.sentence, 'tell gain_step and input_step apart', 'Weigh the coal.'):
+    rmse = (d.rmse_simulation, d.rmse_extended, d.rmse_noise_floor)
+    for part in (d.sentence, 'tell gain_step and input_step apart', 'Weigh the coal.',
+                 *(decimals(value, 2) for value in rmse)):  # fmt: skip
         assert part in first
-    for value in (d.rmse_simulation, d.rmse_extended, d.rmse_noise_floor):
-        assert decimals(value, 2) in first
+    words = words_of(page.to_html())
+    assert '2023-11-15 10:10 UTC' in words
+    assert not re.search(r'\b(nan|None|inf)\b', words)
+    for figure in page.figures:
+        assert figure.caption.startswith('<b>')
+        assert len(words_of(f'<body>{figure.caption}<script')) > 60, figure.name
 
 
 def test_the_one_picture_is_the_variable_that_shows_most():
     data = diagnosed()
-    strong = [replace(s, share_before=0.9 if s.variable == 'time' else 0.1)
-              for s in data.signatures]  # fmt: skip
-    page = diagnosis_page(replace(data, signatures=tuple(strong)))
-    assert page.figures[0].name == 'residual-time'
-    # Every picture stands once.
-    names = [f.name for f in page.figures]
-    assert len(names) == len(set(names))
+    strong = tuple(
+        replace(s, share_before=0.9 if s.variable == 'time' else 0.1) for s in data.signatures
+    )
+    names = [f.name for f in diagnosis_page(replace(data, signatures=strong)).figures]
+    assert names[0] == 'residual-time'
+    assert len(names) == len(set(names)), 'every picture stands once'
     assert {'residual-u', 'fast-moves', 'map-time', 'segments', 'history', 'alarms'} < set(names)
-
-
-@pytest.mark.parametrize(('mean_s', 'told'), [(10.0, '10 s'), (60.0, '1 min')])
-def test_the_proof_says_what_its_differences_are_means_over(mean_s, told):
-    data = diagnosed()
-    page = diagnosis_page(replace(data, diagnosis=replace(data.diagnosis, mean_s=mean_s)))
-    assert f'of means over {told}:' in words_of(page.to_html())
-
-
-def test_the_steps_follow_in_their_order(page):
-    titles = [s.title for s in page.sections]
-    assert titles == [
-        'The answer', '1. What is wrong', '2. Why', '3. The extended model',
-        '4. Check on held-out data',
-        'How the curve moved', 'What the monitor said',
-    ]  # fmt: skip
-
-
-def test_a_moment_is_told_as_a_date(page):
-    words = words_of(page.to_html())
-    assert '2023-11-15 10:10 UTC' in words
-    assert not re.search(r'\b(nan|None|inf)\b', words)
 
 
 def test_a_plant_without_a_fault_is_told_calmly():
@@ -73,16 +54,11 @@ def test_a_plant_without_a_fault_is_told_calmly():
         data.diagnosis, verdict=NOTHING, sentence='Nothing is wrong.', causes=(),
         not_told_apart=(), experiments=(),
     )  # fmt: skip
-    page = diagnosis_page(replace(data, diagnosis=fine, history=None))
+    page = diagnosis_page(replace(data, diagnosis=replace(fine, mean_s=60.0), history=None))
+    assert 'of means over 1 min:' in words_of(page.to_html())
     assert page.title == 'Simulation and measurement agree'
     assert page.sections[0].parts[0] == '<p class="good">Nothing is wrong.</p>'
     assert len(page.sections) == 5
-
-
-def test_every_caption_says_what_to_look_for(page):
-    for figure in page.figures:
-        assert figure.caption.startswith('<b>')
-        assert len(words_of(f'<body>{figure.caption}<script')) > 60, figure.name
 
 
 @pytest.mark.parametrize(
@@ -97,15 +73,12 @@ def test_every_variable_has_an_axis_and_a_hint(name):
     assert not re.search(r'\bu\b', plain_text(axis_titles(name, 0.0)['text']))
 
 
-def test_a_held_cause_is_told_without_a_number_of_days():
+def test_a_held_cause_is_told_and_what_changes_with_time_is_counted_from_the_mean():
     step = HeldCause('gain_step', (('g', 0.0057), ('t0_days', 1.986)), 'From 2023-11-16 on.')
     told = held_words((step,))
     assert 'gain_step (g = 0.0057)' in told
     assert 't0_days' not in told
     assert 'From 2023-11-16 on.' in told
-
-
-def test_what_changes_with_time_is_counted_from_the_mean():
     for name, cause in causes.catalogue().items():
         changes = 'ramp' in cause.act.__code__.co_names or name == 'intervals'
         told = held_words((HeldCause(name, (('x', 0.3),), 'It is so.'),))

@@ -1,18 +1,23 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The drawing of the terminal view: a pure function that always fits the terminal."""
+"""The terminal: a view that always fits, the board behind it, and a bar of progress."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
 import re
+import time
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from monitor_recording import stamp
 
 from valveflow_ros.records import zone_of
 from valveflow_ros.report.terminal import text
+from valveflow_ros.report.terminal.board import AGE, HEALTH, KEPT, MonitorState
 from valveflow_ros.report.terminal.frame import (
     AlarmView,
     CurveView,
@@ -21,6 +26,7 @@ from valveflow_ros.report.terminal.frame import (
     HealthView,
     SampleView,
 )
+from valveflow_ros.report.terminal.progress import Progress, in_words
 from valveflow_ros.report.terminal.screen import DOTS_X, DOTS_Y, Canvas, changes, screen
 from valveflow_ros.report.terminal.text import cells, clean, cut, painted, wrapped
 
@@ -72,7 +78,7 @@ some_frames = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(some_frames, st.integers(1, 200), st.integers(1, 60), st.booleans(), st.booleans())
 def test_whatever_is_known_it_fits_and_nothing_of_others_commands_the_terminal(
     frame, width, height, colour, unicode
@@ -101,46 +107,35 @@ def test_everything_is_on_a_usual_terminal():
     assert '\x1b' not in text
 
 
-def test_times_are_told_in_a_zone():
-    text = re.sub(r'\n +', ' ', '\n'.join(screen(FULL, 80, 24, zone=zone_of('+05:30'))))
-    for part in ('2023-11-15 03:48:20 UTC+05:30', 'raised 2023-11-15 03:43 UTC+05:30'):
-        assert part in text, part
-
-
-def test_without_colour_the_words_are_the_same():
+def test_colour_and_zone_change_no_other_word():
     plain, bright = screen(FULL, 80, 24), screen(FULL, 80, 24, colour=True)
     assert [SGR.sub('', line).rstrip() for line in bright] == [line.rstrip() for line in plain]
     assert any('\x1b[1;31m' in line for line in bright)
+    told = re.sub(r'\n +', ' ', '\n'.join(screen(FULL, 80, 24, zone=zone_of('+05:30'))))
+    for part in ('2023-11-15 03:48:20 UTC+05:30', 'raised 2023-11-15 03:43 UTC+05:30'):
+        assert part in told, part
 
 
-def test_more_room_gives_a_larger_curve():
-    def rows(height):
-        return sum(
-            any(0x2800 < ord(c) < 0x2900 for c in line) for line in screen(FULL, 80, height)
-        )
-
-    assert rows(24) < rows(40) < rows(60)
+def braille(line):
+    return any(0x2800 < ord(c) < 0x2900 for c in line)
 
 
-def test_the_operating_point_lies_on_a_curve_that_goes_through_it():
+def test_more_room_gives_a_larger_curve_on_which_the_operating_point_lies():
+    sizes = [sum(map(braille, screen(FULL, 80, height))) for height in (24, 40, 60)]
+    assert sizes[0] < sizes[1] < sizes[2]
     on = dataclasses.replace(
         FULL, last=dataclasses.replace(sample(300), u=1500.0, measured_mw=250.0)
     )
-    canvas = [line[8:] for line in screen(on, 80, 30) if '●' in line and 'now' not in line]
-    assert len(canvas) == 1
-    row = canvas[0]
-    beside = row[row.index('●') - 1], row[row.index('●') + 1]
-    assert any(0x2800 < ord(c) < 0x2900 for c in beside)
+    (row,) = [line[8:] for line in screen(on, 80, 30) if '●' in line and 'now' not in line]
+    assert braille(row[row.index('●') - 1] + row[row.index('●') + 1])
 
 
 @given(st.integers(1, 40), st.integers(1, 20), st.floats(0, 1), st.floats(0, 1))
 def test_a_dot_stands_where_its_numbers_say(width, height, x, y):
     canvas = Canvas(width, height, (0.0, 0.0), (1.0, 1.0))
     canvas.dot(x, y)
-    rows = canvas.rows()
-    found = [
-        (r, c) for r, line in enumerate(rows) for c, letter in enumerate(line) if letter != ' '
-    ]
+    rows = enumerate(canvas.rows())
+    found = [(r, c) for r, line in rows for c, letter in enumerate(line) if letter != ' ']
     across = round(x * (width * DOTS_X - 1))
     down = height * DOTS_Y - 1 - round(y * (height * DOTS_Y - 1))
     assert found == [(down // DOTS_Y, across // DOTS_X)]
@@ -155,14 +150,12 @@ def test_a_line_reaches_from_end_to_end_without_a_gap():
     assert rows[0][-1] != ' '
 
 
+@settings(max_examples=30)
 @given(texts)
-def test_clean_text_is_one_printable_line(text):
+def test_clean_text_is_one_printable_line_that_cannot_command_the_terminal(text):
     assert all(c.isprintable() or c == '\u202f' for c in clean(text))
     assert clean(clean(text)) == clean(text)
-
-
-def test_a_sentence_cannot_command_the_terminal():
-    hostile = dataclasses.replace(FULL, alarms=(AlarmView('x', 1, '\x1b]0;own\x07\x1b[2J', 0),))
+    hostile = dataclasses.replace(FULL, alarms=(AlarmView('x', 1, f'\x1b]0;{text}\x07', 0),))
     assert '\x1b' not in '\n'.join(screen(hostile, 80, 24))
     assert '\x1b' not in ''.join(told for _, told in changes(Frame(), hostile))
 
@@ -210,3 +203,169 @@ def test_changes_tell_each_thing_once():
     assert changes(FULL, stale) == [('input', 'opening: silent for 9 s.')]
     longer = dataclasses.replace(stale, inputs=(dataclasses.replace(silent, sentence='10 s'),))
     assert changes(stale, longer) == []
+
+
+# The board keeps what it is told, of one unit, within bounds.
+
+
+def test_memory_is_bounded():
+    board = MonitorState()
+    for k in range(3 * KEPT):
+        board.take('valveflow_msgs/msg/Prediction', {
+            'header': {'stamp': stamp(START + k * SECOND), 'frame_id': 'U1'}, 'state': 2,
+            'integrated_input': 1.0, 'measured_mw': 2.0, 'residual_mw': 0.0, 'average_mw': 0.0,
+            'limit_low_mw': 1.0, 'limit_high_mw': 3.0,
+        })  # fmt: skip
+    assert len(board.frame('x').samples) == KEPT
+
+
+@pytest.mark.parametrize('early', [False, True])
+@pytest.mark.parametrize('tag', ['U1', ''])
+# The second is that of earlier versions.
+@pytest.mark.parametrize('prefix', ['unit_1/valveflow_monitor: ', 'valveflow: {} '])
+def test_the_health_of_another_unit_is_not_taken_for_this_ones(tag, early, prefix):
+    def health(of, level, sentence):
+        board.take(HEALTH, {'header': {'frame_id': of}, 'status': [
+            {'name': f'{prefix.format(of)}{name}', 'hardware_id': of, 'level': level,
+             'message': sentence} for name in ('input valve_opening', 'recorder')
+        ]})  # fmt: skip
+
+    def speak():
+        board.take('valveflow_msgs/msg/Diagnosis', {
+            'header': {'stamp': stamp(START), 'frame_id': tag}, 'verdict': 0, 'sentence': '',
+            'causes': [],
+        })  # fmt: skip
+
+    board = MonitorState()
+    if early:
+        # Which monitor of several it is, is not known yet.
+        health('U2', 3, 'silent')
+        speak()
+        assert (board.frame('x').inputs, board.frame('x').recorder) == ((), None)
+    speak()
+    health(tag, 0, 'fine')
+    health('U2', 3, 'silent')
+    frame = board.frame('x')
+    assert [(i.name, i.sentence) for i in frame.inputs] == [('valve_opening', 'fine')]
+    assert frame.recorder.sentence == 'fine'
+
+
+@pytest.mark.parametrize(
+    ('tag', 'names'),
+    [('', ['pump: state']),
+     ('U1', ['pump_node: temperature', 'pump_node: recorders', 'recorder of the pump'])],
+)  # fmt: skip
+def test_what_others_say_and_what_bears_no_tag_is_left_alone(tag, names):
+    board = MonitorState()
+    status = [{'name': n, 'hardware_id': tag, 'level': 2, 'message': 'Hot.'} for n in names]
+    board.take(HEALTH, {'header': {'frame_id': tag}, 'status': status})
+    assert board.items == ()
+    assert board.frame('x').recorder is None
+
+
+@pytest.mark.parametrize(('age', 'later_s'), [('431.5', 431.5), ('unknown', 0.0), ('nan', 0.0)])
+def test_without_a_sample_the_health_tells_how_old_the_curve_is(age, later_s):
+    board = MonitorState()
+    board.take('valveflow_msgs/msg/FlowCharacteristic', {
+        'header': {'stamp': stamp(START), 'frame_id': 'U1'}, 'breakpoints': [1.0, 2.0],
+        'values': [1.0, 2.0], 'status': 1, 'cause': '', 'model_id': 'a', 'samples': 9,
+        'window_start': stamp(START - 9), 'window_end': stamp(START), 'rmse_mw': 0.1,
+    })  # fmt: skip
+    board.take(HEALTH, {'header': {'frame_id': 'U1'}, 'status': [{
+        'name': 'valveflow_monitor: fit', 'hardware_id': 'U1', 'level': 0, 'message': '',
+        'values': [{'key': AGE, 'value': age}],
+    }]})  # fmt: skip
+    assert board.frame('x').now_ns == START + round(later_s * SECOND)
+
+
+# Progress: even, with the time that is left, and quiet where there is no terminal.
+
+
+class Shown:
+    """A progress whose time is ours, its stream and its clock."""
+
+    def __init__(self, bar=True, err=None):
+        self.err, self.now = err or io.StringIO(), 100.0
+        self.progress = Progress(self.err, bar, clock=lambda: self.now)
+        self.progress._start = lambda: None
+
+    def at(self, share, pause_s=0.0):
+        self.progress.at(share, 'working')
+        self.now += pause_s
+
+    @property
+    def last(self):
+        return self.err.getvalue().split('\x1b[K')[-1]
+
+
+def test_the_time_left_follows_from_the_share():
+    shown = Shown()
+    shown.at(0.0, 10.0)
+    assert 'left' not in shown.err.getvalue()
+    shown.at(0.25, 20.0)
+    assert shown.last.endswith(' 25 %  about 30 s left  working')
+    shown.progress.tick()
+    assert shown.last.endswith('about 10 s left  working')
+    shown.now += 20.0
+    shown.progress.tick()
+    assert shown.last.endswith('50 s so far  working')
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
+def test_a_bar_never_goes_back(shares):
+    shown = Shown()
+    for share in shares:
+        shown.at(share, 1.0)
+    percent = [int(found) for found in re.findall(r'(\d+) %', shown.err.getvalue())]
+    assert percent == sorted(percent)
+    assert abs(percent[-1] - 100 * max(shares)) <= 0.5
+
+
+def test_where_there_is_no_terminal_few_lines_come_and_only_late():
+    shown = Shown(bar=False)
+    for second in range(600):
+        shown.at(second / 600.0, 1.0)
+        if second < 15:
+            assert shown.err.getvalue() == ''
+    lines = shown.err.getvalue().splitlines()
+    assert 4 <= len(lines) <= 10
+    assert re.fullmatch(r'\d+ %  .* so far  about .* left  working', lines[1])
+    assert '\x1b' not in shown.err.getvalue()
+
+
+def test_a_bar_suits_its_terminal_and_nothing_is_drawn_after_the_end(monkeypatch):
+    monkeypatch.setenv('COLUMNS', '40')
+    shown = Shown()
+    shown.progress.at(0.5, 'a piece of work with a very long name indeed')
+    assert len(shown.last) < 40
+    shown.progress.end()
+    told = shown.err.getvalue()
+    shown.now += 10.0
+    shown.at(0.6)
+    shown.progress.tick()
+    assert shown.err.getvalue() == told
+    plain = Shown(err=io.TextIOWrapper(io.BytesIO(), encoding='ascii'))
+    plain.at(0.5)
+    plain.err.seek(0)
+    assert '##########..........' in plain.err.read()
+
+
+def test_time_goes_on_by_itself():
+    err = io.StringIO()
+    progress = Progress(err, True)
+    progress.at(0.5, 'working')
+    drawn = err.getvalue().count('\r')
+    end_s = time.monotonic() + 30.0
+    while err.getvalue().count('\r') == drawn:
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    progress.end()
+    assert err.getvalue().endswith('\r\x1b[K')
+
+
+@pytest.mark.parametrize(('seconds', 'words'), [
+    (0.4, '0 s'), (59.4, '59 s'), (61.0, '1 min'), (131.0, '2 min 10 s'), (3600.0, '1 h'),
+    (3900.0, '1 h 5 min'),
+])  # fmt: skip
+def test_lengths_of_time(seconds, words):
+    assert in_words(seconds) == words

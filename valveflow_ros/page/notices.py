@@ -72,25 +72,16 @@ def _time(time_ns: int) -> str | None:
 class Sender:
     """Delivers notices in order, in a separate thread.
 
-    Parameters
-    ----------
-    deliver : callable
-        Delivers one notice, or raises `DeliveryError`; it must not block without limit.
-    pauses_s : sequence of float
-        Pauses before each further attempt, in seconds; after the last one the notice is dropped.
-    complain : callable
-        Called with a sentence on each failure.
+    ``deliver`` raises `DeliveryError` and must not block without limit. After the last of the
+    pauses before each further attempt the notice is dropped; each failure is complained of.
     """
 
     def __init__(
-        self,
-        deliver: Deliver,
-        pauses_s: Sequence[float] = PAUSES_S,
+        self, deliver: Deliver, pauses_s: Sequence[float] = PAUSES_S,
         complain: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        self._deliver = deliver
+    ) -> None:  # fmt: skip
+        self._deliver, self._complain = deliver, complain
         self._pauses_s = tuple(pauses_s)
-        self._complain = complain
         self._ready = threading.Condition()
         self._waiting: deque[bytes] = deque()
         self._closing = threading.Event()
@@ -124,32 +115,26 @@ class Sender:
                     return
                 content = self._waiting.popleft()
                 self._ready.notify_all()
-            if self._tried(content):
-                self.sent += 1
-            else:
-                self.failed += 1
+            self._try(content)
 
-    def _tried(self, content: bytes) -> bool:
-        """Return True after delivery, False after the last failed attempt."""
+    def _try(self, content: bytes) -> None:
         for pause_s in (*self._pauses_s, None):
             try:
                 self._deliver(content)
-                return True
+                self.sent += 1
+                return
             except DeliveryError as error:
                 again = 'given up' if pause_s is None else f'next try in {pause_s:g} s'
                 self._complain(f'A notice of an alarm was not delivered ({again}): {error}.')
             if pause_s is None or self._closing.wait(pause_s):
-                return False
-        return False
+                break
+        self.failed += 1
 
 
 def command(line: str, limit_s: float = LIMIT_S) -> Deliver:
     """Return a function that runs a command with the notice on its standard input, without shell.
 
-    Raises
-    ------
-    UsageError
-        The line cannot be parsed as a command.
+    Raises `UsageError` if the line cannot be parsed as a command.
     """
     try:
         words = shlex.split(line)
@@ -183,10 +168,7 @@ def command(line: str, limit_s: float = LIMIT_S) -> Deliver:
 def webhook(url: str, limit_s: float = LIMIT_S) -> Deliver:
     """Return a function that sends the notice by HTTP POST; redirections are not followed.
 
-    Raises
-    ------
-    UsageError
-        It is not an address of HTTP or HTTPS.
+    Raises `UsageError` if it is not an address of HTTP or HTTPS.
     """
     wrong = f"--webhook must be an address such as https://host/path; '{url}' is not."
     try:
@@ -219,9 +201,8 @@ def webhook(url: str, limit_s: float = LIMIT_S) -> Deliver:
             status = connection.getresponse().status
         except (OSError, http.client.HTTPException) as error:
             slow = late.is_set() or isinstance(error, TimeoutError)
-            said = (
-                f'no answer within {limit_s:g} s' if slow else str(error) or type(error).__name__
-            )
+            said = str(error) or type(error).__name__
+            said = f'no answer within {limit_s:g} s' if slow else said
             raise DeliveryError(f'{host}: {said}') from None
         finally:
             timer.cancel()
@@ -235,29 +216,20 @@ def webhook(url: str, limit_s: float = LIMIT_S) -> Deliver:
 class Notices:
     """Reports each alarm change to a command, to a webhook, to both or to none.
 
-    Parameters
-    ----------
-    line, url : str or None
-        The command and the address; None if not used.
-    complain : callable
-        Called with a sentence on each failure.
-
-    Raises
-    ------
-    UsageError
-        The command or the address is invalid.
+    Raises `UsageError` if the command or the address is invalid.
     """
 
     def __init__(self, line: str | None, url: str | None, complain: Callable[[str], None]) -> None:
-        makers = [command(line)] if line is not None else []
-        makers += [webhook(url)] if url is not None else []
+        makers = [
+            make(given) for make, given in ((command, line), (webhook, url)) if given is not None
+        ]
         self._senders = [Sender(deliver, complain=complain) for deliver in makers]
 
     def tell(self, changes: Iterable[AlarmChange]) -> None:
         """Queue changes; returns immediately."""
-        for change in changes if self._senders else ():
+        for content in map(notice, changes):
             for sender in self._senders:
-                sender.put(notice(change))
+                sender.put(content)
 
     def counters(self) -> dict[str, tuple[str, float]]:
         """Return counters of the notices by name: help text and value."""

@@ -102,12 +102,7 @@ def _port(text: str) -> int:
 def read_token(path: Path) -> str:
     """Return the token in a file: its first line.
 
-    Raises
-    ------
-    RecordingError
-        The file cannot be read.
-    InputError
-        The token is too short.
+    Raises `RecordingError` if it cannot be read, `InputError` if the token is too short.
     """
     try:
         with path.open(encoding='utf-8') as file:
@@ -127,38 +122,18 @@ class Guard:
 
     A page of another site may be open in the same browser, also under a host name that its owner
     directs to this machine (DNS rebinding). So the requested host must be one of ours, and a
-    request with an origin must have ours.
-
-    Parameters
-    ----------
-    application : WSGI application
-    policy : str
-        The content security policy of the page.
-    metrics : callable
-        Returns the metrics as text.
-    names : sequence of str
-        Names of this machine in addition to its addresses and its host name.
-    connections : callable
-        Returns the number of open connections.
-    complain : callable
-        Called with a sentence if a request could not be answered, at most once a minute.
+    request with an origin must have ours. It complains at most once a minute if a request could
+    not be answered.
     """
 
     def __init__(
-        self,
-        application: Wsgi,
-        policy: str,
-        metrics: Callable[[], bytes],
-        names: Sequence[str] = (),
-        connections: Callable[[], int] = lambda: 0,
-        complain: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        self._application = application
-        self._metrics = metrics
+        self, application: Wsgi, policy: str, metrics: Callable[[], bytes], names: Sequence[str],
+        connections: Callable[[], int], complain: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        self._application, self._metrics = application, metrics
         host = socket.gethostname().lower()
         self._names = {'localhost', host, *(name.lower() for name in names)}
-        self._connections = connections
-        self._complain = complain
+        self._connections, self._complain = connections, complain
         self._told_s = -_TELL_S
         self._static: dict[str, tuple[list[tuple[str, str]], bytes]] = {}
         self._head = [
@@ -204,12 +179,9 @@ class Guard:
             return self._say(start, '400 Bad Request', 'This request cannot be answered.')
 
     def _refusal(self, environ: dict[str, Any]) -> tuple[str, str] | None:
-        """Return status and sentence for a rejected request; None if it is allowed."""
-        host = str(environ.get('HTTP_HOST', ''))
-        path = str(environ.get('PATH_INFO', ''))
+        host, path = str(environ.get('HTTP_HOST', '')), str(environ.get('PATH_INFO', ''))
         wanted = 'GET' if path.startswith(_STATIC) else _PATHS.get(path)
-        method = environ.get('REQUEST_METHOD')
-        origin = environ.get('HTTP_ORIGIN')
+        method, origin = environ.get('REQUEST_METHOD'), environ.get('HTTP_ORIGIN')
         if self._connections() > MOST_CONNECTIONS:
             return '503 Service Unavailable', 'Too many connections; try again.'
         if not self._ours(host):
@@ -275,7 +247,6 @@ class Guard:
 
 
 def _whole(application: Wsgi, environ: dict[str, Any]) -> tuple[str, Any, bytes]:
-    """Return an answer as status, header and body."""
     kept: list[Any] = []
 
     def start(status: str, head: list[tuple[str, str]], *_: Any) -> None:
@@ -295,43 +266,17 @@ def _whole(application: Wsgi, environ: dict[str, Any]) -> tuple[str, Any, bytes]
 
 
 class PageServer:
-    """Serves the page and the metrics in separate threads.
+    """Serves the page and the metrics in separate threads; port 0 is any free port.
 
-    Parameters
-    ----------
-    shown : Shown
-    host : str
-        Address to listen on.
-    port : int
-        0: any free port.
-    names : sequence of str
-        Further names of this machine.
-    asking : Asking, optional
-        Handles requests of authorised users to a monitor.
-    counters : callable, optional
-        Further counters for the metrics.
-    complain : callable
-        Called with a sentence if a request could not be answered.
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
-
-    Raises
-    ------
-    ValveflowError
-        The address cannot be used.
+    ``names`` are further names of this machine, ``asking`` an `Asking` for requests of authorised
+    users to a monitor. Raises `ValveflowError` if the address cannot be used.
     """
 
     def __init__(
-        self,
-        shown: Shown,
-        host: str = '127.0.0.1',
-        port: int = PORT,
-        names: Sequence[str] = (),
-        asking: Any = None,
-        counters: Callable[[], dict[str, tuple[str, float]]] = dict,
-        complain: Callable[[str], None] = lambda _: None,
-        zone: tzinfo | None = None,
-    ) -> None:
+        self, shown: Shown, host: str = '127.0.0.1', port: int = PORT, names: Sequence[str] = (),
+        asking: Any = None, counters: Callable[[], dict[str, tuple[str, float]]] = dict,
+        complain: Callable[[str], None] = lambda _: None, zone: tzinfo | None = None,
+    ) -> None:  # fmt: skip
         # Check the port first: loading the libraries takes time.
         listener = _listener(host, port)
         try:
@@ -343,12 +288,13 @@ class PageServer:
             _quiet()
             app, policy = make_app(shown, asking, zone)
             self._sockets: dict[int, Any] = {}
-            metrics = Metrics(shown, lambda: {**counters(), **self._counters()})
+            refused = 'valveflow_page_requests_refused'
+            metrics = Metrics(
+                shown, lambda: counters() | {refused: ('Requests refused.', self.guard.refused)}
+            )
             # The guard reports errors as a sentence.
             app.server.config['PROPAGATE_EXCEPTIONS'] = True
-            self.guard = Guard(
-                app.server, policy, metrics.text, names, self.connections, complain
-            )  # fmt: skip
+            self.guard = Guard(app.server, policy, metrics.text, names, self.connections, complain)
             self._server = create_server(
                 self.guard, map=self._sockets, sockets=[listener], threads=_THREADS,
                 connection_limit=_MOST_ACCEPTED, channel_timeout=IDLE_S,
@@ -394,9 +340,6 @@ class PageServer:
             channel.close()
         self._sockets.clear()
 
-    def _counters(self) -> dict[str, tuple[str, float]]:
-        return {'valveflow_page_requests_refused': ('Requests refused.', self.guard.refused)}
-
     def _run(self) -> None:
         # At the end the sockets are closed during the wait.
         with suppress(OSError, ValueError):
@@ -425,7 +368,6 @@ class PageServer:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """Return a bound socket; raises `ValveflowError`."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host.strip('[]'), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

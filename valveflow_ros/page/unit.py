@@ -26,22 +26,12 @@ MOST_UNITS = 16
 
 @dataclass(frozen=True, slots=True)
 class Minute:
-    """The samples of one minute.
-
-    Attributes
-    ----------
-    start_ns : int
-        Begin of the minute, ns since 1970.
-    measured_mw, predicted_mw : float
-        Means, MW; NaN if unknown.
-    low_mw, high_mw : float
-        Lowest and highest measured power, MW; NaN if unknown.
-    """
+    """The samples of one minute; NaN if unknown."""
 
     start_ns: int
-    measured_mw: float
-    predicted_mw: float
-    low_mw: float
+    measured_mw: float  # mean
+    predicted_mw: float  # mean
+    low_mw: float  # lowest measured power
     high_mw: float
 
 
@@ -51,7 +41,10 @@ class Day:
     def __init__(self) -> None:
         self._closed: deque[Minute] = deque(maxlen=MINUTES)
         self._view: tuple[Minute, ...] = ()
-        self._start_ns = -1
+        self._begin(-1)
+
+    def _begin(self, start_ns: int) -> None:
+        self._start_ns = start_ns
         self._n = self._n_predicted = 0
         self._sum = self._sum_predicted = 0.0
         self._low, self._high = math.inf, -math.inf
@@ -83,71 +76,37 @@ class Day:
             self._view = tuple(self._closed)
         return self._view
 
-    def _begin(self, start_ns: int) -> None:
-        self._start_ns = start_ns
-        self._n = self._n_predicted = 0
-        self._sum = self._sum_predicted = 0.0
-        self._low, self._high = math.inf, -math.inf
-
     def _close(self) -> None:
-        if self._start_ns < 0:
-            return
-        if not self._n:
-            nothing = Minute(self._start_ns, math.nan, math.nan, math.nan, math.nan)
-            self._closed.append(nothing)
-            return
-        known = self._n_predicted
-        predicted = self._sum_predicted / known if known else math.nan
-        self._closed.append(
-            Minute(self._start_ns, self._sum / self._n, predicted, self._low, self._high)
+        known, nan = self._n_predicted, math.nan
+        predicted = self._sum_predicted / known if known else nan
+        numbers = (
+            (self._sum / self._n, predicted, self._low, self._high) if self._n else (nan,) * 4
         )
+        if self._start_ns >= 0:
+            self._closed.append(Minute(self._start_ns, *numbers))
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmChange:
-    """A change of the state of an alarm; states are indices in `frame.ALARM_STATES`.
+    """A change of the state of an alarm; states are indices in `frame.ALARM_STATES`."""
 
-    Attributes
-    ----------
-    unit, monitor : str
-        Tag of the unit; name of the monitor's node, or of the recording.
-    alarm : AlarmView
-        Its present state.
-    previous : int or None
-        Its state before; None if unknown, because the page was started later.
-    time_ns : int
-        Time of the change, ns since 1970.
-    """
-
-    unit: str
-    monitor: str
-    alarm: AlarmView
-    previous: int | None
-    time_ns: int
+    unit: str  # its tag
+    monitor: str  # name of the monitor's node, or of the recording
+    alarm: AlarmView  # its present state
+    previous: int | None  # its state before; None if unknown: the page was started later
+    time_ns: int  # of the change
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A unit at one time; it is immutable, so any thread may read it.
+    """A unit at one time; it is immutable, so any thread may read it."""
 
-    Attributes
-    ----------
-    key : str
-        Name of the monitor's node, or of the recording.
-    frame : Frame
-    day : tuple of Minute
-        The last 24 hours without the current minute; the same object while unchanged.
-    items : tuple of ItemView
-        All health items with their values.
-    present : bool
-        False if the monitor is no longer present.
-    """
-
-    key: str
+    key: str  # name of the monitor's node, or of the recording
     frame: Frame
+    # The last 24 hours without the current minute; the same object while unchanged.
     day: tuple[Minute, ...] = ()
-    items: tuple[ItemView, ...] = ()
-    present: bool = True
+    items: tuple[ItemView, ...] = ()  # the health
+    present: bool = True  # the monitor is there
 
     @property
     def title(self) -> str:
@@ -156,13 +115,7 @@ class Snapshot:
 
 
 class Unit(MonitorState):
-    """The state of one monitor for the page, with bounded memory.
-
-    Parameters
-    ----------
-    key : str
-        Name of the monitor's node, or of the recording.
-    """
+    """The state of one monitor for the page, with bounded memory."""
 
     def __init__(self, key: str) -> None:
         super().__init__()
@@ -191,20 +144,18 @@ class Unit(MonitorState):
         """
         told = list(self._changes)
         self._changes.clear()
-        if not self._settled:
-            self._calls += bool(self._tag is not None)
-            last = {change.alarm.name: change for change in told}
-            return [change for change in last.values() if change.alarm.state != NORMAL]
-        return told
+        if self._settled:
+            return told
+        self._calls += self._tag is not None
+        last = {change.alarm.name: change for change in told}
+        return [change for change in last.values() if change.alarm.state != NORMAL]
 
     @property
-    def _settled(self) -> bool:
-        """Return True after the latched messages have arrived."""
+    def _settled(self) -> bool:  # the latched messages have arrived
         return self._calls >= _FIRST_CALLS
 
     def _note_change(self, name: str, stamp: Mapping[str, Any]) -> None:
-        alarm = self._alarms.get(name)
-        before = self._states.get(name)
+        alarm, before = self._alarms.get(name), self._states.get(name)
         if alarm is None or alarm.state == before:
             return
         self._states[name] = alarm.state
@@ -221,19 +172,9 @@ class Shown:
     """The content of the page at this time: set by one thread, read by others."""
 
     def __init__(self) -> None:
-        self._both: tuple[tuple[Snapshot, ...], str] = ((), '')
+        self.units: tuple[Snapshot, ...] = ()
+        self.note = ''  # a sentence for the top of the page
 
     def put(self, units: Iterable[Snapshot], note: str = '') -> None:
         """Replace everything; at most `MOST_UNITS` units are kept."""
-        # A single assignment, so that readers always get a consistent pair.
-        self._both = (tuple(units)[:MOST_UNITS], note)
-
-    @property
-    def units(self) -> tuple[Snapshot, ...]:
-        """Return the units in their order."""
-        return self._both[0]
-
-    @property
-    def note(self) -> str:
-        """Return a sentence for the top of the page, empty if there is none."""
-        return self._both[1]
+        self.units, self.note = tuple(units)[:MOST_UNITS], note

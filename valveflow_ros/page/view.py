@@ -29,6 +29,7 @@ from valveflow_ros.page.unit import MINUTE_NS, MOST_UNITS, Shown, Snapshot
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.figure import Spec, axis, line, local_ms, points, rounded, token
 from valveflow_ros.report.page import read_text
+from valveflow_ros.report.terminal import frame as views
 from valveflow_ros.report.terminal.frame import (
     ACKNOWLEDGED,
     BAD_DATA,
@@ -40,12 +41,6 @@ from valveflow_ros.report.terminal.frame import (
     Frame,
     HealthView,
     Said,
-    alarms_words,
-    curve_words,
-    diagnosis_words,
-    recorder_words,
-    sample_words,
-    short_name,
 )
 from valveflow_ros.report.terminal.text import clean
 from valveflow_ros.report.words import in_zone, input_axis, moment
@@ -84,20 +79,15 @@ def summary(frame: Frame, present: bool) -> Said:
     if not present:
         return 'no monitor', 'bad'
     states = {alarm.state for alarm in frame.alarms if alarm.standing}
-    if UNACKNOWLEDGED in states:
-        return 'alarm', 'bad'
-    if ACKNOWLEDGED in states:
-        return 'alarm, acknowledged', 'bad'
-    if frame.last is not None and frame.last.state == BAD_DATA:
-        return 'bad data', 'bad'
-    levels = [item.level for item in frame.inputs]
-    if any(level in (ERROR, STALE) for level in levels):
-        return 'input fault', 'bad'
-    if states:
-        return 'alarm to be looked at', 'warn'
-    if frame.curve is None or not frame.curve.breakpoints:
-        return 'no curve yet', 'dim'
-    return 'no alarm', 'good'
+    words = (
+        (UNACKNOWLEDGED in states, 'alarm', 'bad'),
+        (ACKNOWLEDGED in states, 'alarm, acknowledged', 'bad'),
+        (frame.last is not None and frame.last.state == BAD_DATA, 'bad data', 'bad'),
+        (any(item.level in (ERROR, STALE) for item in frame.inputs), 'input fault', 'bad'),
+        (bool(states), 'alarm to be looked at', 'warn'),
+        (frame.curve is None or not frame.curve.breakpoints, 'no curve yet', 'dim'),
+    )
+    return next(((word, tone) for holds, word, tone in words if holds), ('no alarm', 'good'))
 
 
 def _head(unit: Snapshot, zone: tzinfo | None) -> list[Any]:
@@ -112,51 +102,40 @@ def _head(unit: Snapshot, zone: tzinfo | None) -> list[Any]:
     return [*made, html.P(note, className='notice')] if note else made
 
 
-def _diagnosis(frame: Frame, zone: tzinfo | None) -> list[Any]:
-    found = frame.diagnosis
-    said = diagnosis_words(None if found is None else replace(found, advice=()))
-    advice = () if found is None else found.advice
-    return [_said(said, zone), *(html.P(clean(in_zone(one, zone))) for one in advice)]
-
-
 def _row(item: HealthView, zone: tzinfo | None) -> Any:
     word, tone = _LEVELS.get(item.level, (f'level {item.level}', 'bad'))
     return html.Tr([
-        html.Th(short_name(item.name), scope='row'),
+        html.Th(views.short_name(item.name), scope='row'),
         html.Td(html.Span(word, className=f'pill {tone}')),
         html.Td(clean(in_zone(item.sentence, zone)), className='words'),
     ])  # fmt: skip
 
 
 def _health(frame: Frame, zone: tzinfo | None) -> list[Any]:
-    text, tone = recorder_words(frame)
+    text, tone = views.recorder_words(frame)
     if not frame.inputs:
         return [html.P('Nothing has come from any input yet.', className='dim')]
+    unknown = html.Tr([html.Th('recorder'), html.Td(), html.Td(text, className=tone)])
     rows = [_row(item, zone) for item in frame.inputs]
-    if frame.recorder is not None:
-        rows.append(_row(frame.recorder, zone))
-    else:
-        rows.append(html.Tr([html.Th('recorder'), html.Td(), html.Td(text, className=tone)]))
+    rows.append(unknown if frame.recorder is None else _row(frame.recorder, zone))
     return [html.Div(html.Table(html.Tbody(rows)), className='scroll')]
 
 
 def words(unit: Snapshot, zone: tzinfo | None = None) -> dict[str, list[Any]]:
     """Return the content of each of `PARTS` as Dash components; times in a zone, or in UTC."""
-    frame = unit.frame
+    frame, curve, found = unit.frame, unit.frame.curve, unit.frame.diagnosis
+    # The age of the curve in whole minutes, so that it does not change every second.
+    now_ns = max(0 if curve is None else curve.window[1], frame.now_ns - frame.now_ns % MINUTE_NS)
+    said = views.diagnosis_words(None if found is None else replace(found, advice=()))
+    advice = () if found is None else found.advice
     return {
         'head': _head(unit, zone),
-        'alarms': [_said(said, zone) for said in alarms_words(frame)],
-        'curve_words': [_said(curve_words(frame.curve, _whole_minute(frame)), zone)],
-        'now': [_said(sample_words(frame.last), zone)],
-        'diagnosis': _diagnosis(frame, zone),
+        'alarms': [_said(said, zone) for said in views.alarms_words(frame)],
+        'curve_words': [_said(views.curve_words(curve, now_ns), zone)],
+        'now': [_said(views.sample_words(frame.last), zone)],
+        'diagnosis': [_said(said, zone), *(html.P(clean(in_zone(a, zone))) for a in advice)],
         'health': _health(frame, zone),
     }
-
-
-def _whole_minute(frame: Frame) -> int:
-    """Return the time rounded to minutes, so that displayed ages do not change every second."""
-    end_ns = 0 if frame.curve is None else frame.curve.window[1]
-    return max(end_ns, frame.now_ns - frame.now_ns % (60 * NS_PER_S))
 
 
 # Figures, in the format of `report.figure`: colours by name.
@@ -164,33 +143,28 @@ def _whole_minute(frame: Frame) -> int:
 
 def curve_picture(frame: Frame) -> Spec:
     """Return the curve with the last 15 minutes and the present operating point."""
-    curve, last = frame.curve, frame.last
-    traces = []
-    e = math.nan
+    curve, last, traces = frame.curve, frame.last, []
     if curve is not None:
-        e = curve.exponent
-        traces.append(
-            line(rounded(curve.breakpoints), rounded(curve.values), 'curve', 'curve',
-                 'curve: %{y:.1f} at u = %{x:.0f}<extra></extra>', mode='lines+markers')
-        )  # fmt: skip
-    recent = _recent(frame)
-    if recent:
-        traces.append(
-            points(rounded([s.u for s in recent]), rounded([s.measured_mw for s in recent]),
-                   'last 15 min', 'data-soft', size=4)
-        )  # fmt: skip
+        traces.append(line(
+            rounded(curve.breakpoints), rounded(curve.values), 'curve', 'curve',
+            'curve: %{y:.1f} at u = %{x:.0f}<extra></extra>', mode='lines+markers',
+        ))  # fmt: skip
+    if recent := _recent(frame):
+        traces.append(points(
+            rounded([s.u for s in recent]), rounded([s.measured_mw for s in recent]),
+            'last 15 min', 'data-soft', size=4,
+        ))  # fmt: skip
     if last is not None and math.isfinite(last.u) and math.isfinite(last.measured_mw):
         mark = {'size': 13, 'symbol': 'diamond', 'line': {'color': token('paper'), 'width': 2}}
-        traces.append(
-            points(rounded([last.u]), rounded([last.measured_mw]), 'now', 'steady',
-                   'now: %{y:.1f} at u = %{x:.0f}<extra></extra>', marker=mark)
-        )  # fmt: skip
-    layout = {'xaxis': axis(input_axis(e)), 'yaxis': axis('power (MW)')}
-    return {'data': traces, 'layout': layout}
+        traces.append(points(
+            rounded([last.u]), rounded([last.measured_mw]), 'now', 'steady',
+            'now: %{y:.1f} at u = %{x:.0f}<extra></extra>', marker=mark,
+        ))  # fmt: skip
+    across = axis(input_axis(math.nan if curve is None else curve.exponent))
+    return {'data': traces, 'layout': {'xaxis': across, 'yaxis': axis('power (MW)')}}
 
 
 def _recent(frame: Frame) -> list[Any]:
-    """Return the samples of the last 15 minutes, reduced to the number for a figure."""
     begin_ns = frame.now_ns - RECENT_S * NS_PER_S
     found = [s for s in frame.samples if s.time_ns >= begin_ns]
     step = -(-len(found) // _MOST_RECENT) or 1
@@ -205,16 +179,11 @@ def _ms(time_ns: int) -> float:
 def recent_picture(frame: Frame, zone: tzinfo | None = None) -> Spec:
     """Return prediction with its limits and measurement over the last 15 minutes."""
     found = _recent(frame)
-    predicted = [s.measured_mw - s.residual_mw for s in found]
-    columns = (
-        [s.measured_mw for s in found], predicted,
-        [p + s.low_mw for p, s in zip(predicted, found, strict=True)],
-        [p + s.high_mw for p, s in zip(predicted, found, strict=True)],
-    )  # fmt: skip
     if not found:
         return _empty('No sample has come yet.')
-    t = [_ms(s.time_ns) for s in found]
-    return _against(t, columns, '95 % limits', zone)
+    expected = [(s, s.measured_mw - s.residual_mw) for s in found]
+    rows = [(_ms(s.time_ns), s.measured_mw, p, p + s.low_mw, p + s.high_mw) for s, p in expected]
+    return _against(rows, '95 % limits', zone)
 
 
 def day_picture(unit: Snapshot, zone: tzinfo | None = None) -> Spec:
@@ -222,19 +191,14 @@ def day_picture(unit: Snapshot, zone: tzinfo | None = None) -> Spec:
     day = unit.day
     if len(day) < 2:
         return _empty('A point comes each minute.')
-    t: list[float] = []
-    columns: tuple[list[float], ...] = ([], [], [], [])
+    rows, nan = [], math.nan
     late = (b.start_ns - a.start_ns > 90 * NS_PER_S for a, b in pairwise(day))
     for gap, m in zip(chain([False], late), day, strict=False):
         if gap:
-            t.append(_ms(m.start_ns) - 1)
-            for column in columns:
-                column.append(math.nan)
-        t.append(_ms(m.start_ns + MINUTE_NS // 2))
-        values = (m.measured_mw, m.predicted_mw, m.low_mw, m.high_mw)
-        for column, value in zip(columns, values, strict=True):
-            column.append(value)
-    made = _against(t, columns, 'least to largest', zone)
+            rows.append((_ms(m.start_ns) - 1, nan, nan, nan, nan))
+        middle = _ms(m.start_ns + MINUTE_NS // 2)
+        rows.append((middle, m.measured_mw, m.predicted_mw, m.low_mw, m.high_mw))
+    made = _against(rows, 'least to largest', zone)
     made['layout']['xaxis']['rangeslider'] = {
         'thickness': 0.16, 'bgcolor': token('panel'), 'borderwidth': 1,
         'bordercolor': token('rule'),
@@ -242,11 +206,10 @@ def day_picture(unit: Snapshot, zone: tzinfo | None = None) -> Spec:
     return made
 
 
-def _against(
-    t: Sequence[float], columns: Sequence[Sequence[float]], band: str, zone: tzinfo | None
-) -> Spec:
-    """Return a figure over time; columns: measured, predicted, and the edges of a band."""
-    t = t if zone is None else [local_ms(ms, zone) for ms in t]
+def _against(rows: Sequence[tuple[float, ...]], band: str, zone: tzinfo | None) -> Spec:
+    """Return a figure over time of rows: ms, measured, predicted, and the edges of a band."""
+    times, *columns = zip(*rows, strict=True)
+    t = list(times) if zone is None else [local_ms(ms, zone) for ms in times]
     measured, predicted, low, high = map(rounded, columns)
     edge: Any = {'line': {'width': 0}, 'showlegend': False}
     traces = [
@@ -257,14 +220,10 @@ def _against(
     ]
     # No fixed range: updating it would undo the scrolling of the user.
     across = axis('', type='date', tickangle=0, nticks=6)
-    return {
-        'data': traces,
-        'layout': {'xaxis': across, 'yaxis': axis('power (MW)')},
-    }
+    return {'data': traces, 'layout': {'xaxis': across, 'yaxis': axis('power (MW)')}}
 
 
 def _empty(sentence: str) -> Spec:
-    """Return a figure with a sentence on why it is empty."""
     told = {'text': sentence, 'showarrow': False, 'xref': 'paper', 'yref': 'paper', 'x': 0.5,
             'y': 0.5, 'font': {'color': token('muted')}}  # fmt: skip
     hidden = axis('', visible=False)
@@ -282,14 +241,7 @@ class Made(NamedTuple):
 
 
 class Maker:
-    """Makes texts and figures of units, each once for all browsers.
-
-    Parameters
-    ----------
-    shown : Shown
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
-    """
+    """Makes texts and figures of units, each once for all browsers."""
 
     def __init__(self, shown: Shown, zone: tzinfo | None = None) -> None:
         self.shown, self.zone = shown, zone
@@ -305,10 +257,11 @@ class Maker:
         """Return every part of a unit by its name."""
         frame, day, zone = unit.frame, unit.day, self.zone
         live = (frame.now_ns, frame.last, frame.curve)
-        told = self._once(
-            unit, 'words', (frame, unit.present), lambda: _versions(words(unit, zone))
-        )
-        return dict(told.content) | {
+
+        def told() -> dict[str, Made]:
+            return {name: Made(_digest(made), made) for name, made in words(unit, zone).items()}
+
+        return dict(self._once(unit, 'words', (frame, unit.present), told).content) | {
             'curve': self._once(unit, 'curve', live, lambda: curve_picture(frame)),
             'recent': self._once(unit, 'recent', live[:2], lambda: recent_picture(frame, zone)),
             'day': self._once(unit, 'day', day[:1] + day[-1:], lambda: day_picture(unit, zone)),
@@ -333,10 +286,6 @@ _MOST_KEPT = 8 * MOST_UNITS
 
 def _digest(*parts: object) -> str:
     return sha256(repr(parts).encode()).hexdigest()[:12]
-
-
-def _versions(told: Mapping[str, Any]) -> dict[str, Made]:
-    return {name: Made(_digest(content), content) for name, content in told.items()}
 
 
 # The page.
@@ -379,7 +328,7 @@ def _block(number: int, told: Mapping[str, Made], may_ask: bool) -> Any:
 
     return html.Section(html.Div([
         html.Div(part('head'), className='title'),
-                html.Div(part('alarms', 'Alarms') + ask, className='top'),
+        html.Div(part('alarms', 'Alarms') + ask, className='top'),
         html.Div(
             [_picture(number, 'curve'), *part('curve_words'), _picture(number, 'recent'),
              *part('now')], className='pictures',
@@ -394,7 +343,11 @@ def _block(number: int, told: Mapping[str, Made], may_ask: bool) -> Any:
 def _page(maker: Maker, may_ask: bool) -> Any:
     units = maker.shown.units
     blocks = [_block(k, maker.parts(unit), may_ask) for k, unit in enumerate(units)]
-    blocks = blocks or [_nowhere()]
+    # Without any part, Dash would not tick at all.
+    nowhere = [_part(-1, name) for name in PARTS]
+    blocks = blocks or [
+        html.Div([*nowhere, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
+    ]
     token_field = [
         html.Label(['Token for the buttons: ', dcc.Input(id='token', type='password', value='')],
                    className='token'),
@@ -412,21 +365,10 @@ def _page(maker: Maker, may_ask: bool) -> Any:
     ], id='page')  # fmt: skip
 
 
-def _nowhere() -> Any:
-    """Return the parts of a dummy unit: without any part, Dash would not tick at all."""
-    parts = [_part(-1, name) for name in PARTS]
-    return html.Div([*parts, dcc.Store(id={'unit': -1, 'part': 'pictures'})], hidden=True)
-
-
 class Asking:
-    """Lets a browser with the token send requests to a monitor.
+    """Lets a browser with the token, which is not empty, send requests to a monitor.
 
-    Parameters
-    ----------
-    token : str
-        The secret token of authorised browsers; not empty.
-    ask : callable
-        Takes the key of a unit and one of `ASKED`; returns success and a sentence.
+    ``ask`` takes the key of a unit and one of `ASKED`; it returns success and a sentence.
     """
 
     def __init__(self, token: str, ask: Ask) -> None:
@@ -466,14 +408,7 @@ def make_app(
 ) -> tuple[Dash, str]:
     """Return the page as a Dash application, and its content security policy.
 
-    Parameters
-    ----------
-    shown : Shown
-        The displayed content; replaced by another thread.
-    asking : Asking, optional
-        Handles requests to a monitor; without it the page has no buttons.
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
+    The content is replaced by another thread; without ``asking`` the page has no buttons.
     """
     maker = Maker(shown, zone)
     script = read_text('colours.js') + _file('page.js')
@@ -489,7 +424,8 @@ def make_app(
     _update(app, maker)
     if asking is not None:
         _answer(app, shown, asking)
-    inline = [*app.csp_hashes(), _hash(script)]
+    own = b64encode(sha256(script.encode()).digest()).decode()
+    inline = [*app.csp_hashes(), f"'sha256-{own}'"]
     return app, (
         f"default-src 'self'; script-src 'self' {' '.join(inline)}; "
         "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
@@ -499,10 +435,6 @@ def make_app(
 
 def _file(name: str) -> str:
     return resources.files('valveflow_ros.page').joinpath(name).read_text(encoding='utf-8')
-
-
-def _hash(script: str) -> str:
-    return f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'"
 
 
 def _index(script: str) -> str:
@@ -516,7 +448,6 @@ def _index(script: str) -> str:
 
 
 def _update(app: Dash, maker: Maker) -> None:
-    """Update the content in a browser at each tick."""
     everything = (*PARTS, 'pictures')
 
     @app.callback(  # type: ignore[untyped-decorator]
@@ -560,8 +491,6 @@ def _update(app: Dash, maker: Maker) -> None:
 
 
 def _answer(app: Dash, shown: Shown, asking: Asking) -> None:
-    """Forward a request to the monitor, and show the answer next to the button."""
-
     @app.callback(  # type: ignore[untyped-decorator]
         Output({'unit': ALL, 'part': 'answer'}, 'children'),
         Input({'unit': ALL, 'ask': ALL}, 'n_clicks'), State('token', 'value'),

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter, Value
@@ -37,6 +39,21 @@ class LoopInputs:
     input_gain: FloatArray
     offset_mw: FloatArray
 
+    @classmethod
+    def forced(
+        cls, hooks: Hooks, time_s: FloatArray, clock_s: FloatArray, pressure_mpa: FloatArray,
+        temperature_degc: FloatArray,
+    ) -> LoopInputs:  # fmt: skip
+        """Return the inputs from outside with what the effects of a run do to them."""
+        one, outside = np.ones(time_s.size), (time_s, clock_s, pressure_mpa, temperature_degc)
+        rows = cls(*outside, one, one.copy(), np.zeros(time_s.size))
+        for change in hooks.forcing:
+            change(rows)
+        return rows
+
+
+Change = Callable[[LoopInputs], NDArray[Any]]
+
 
 @dataclass(frozen=True, slots=True)
 class HistorianRows:
@@ -48,25 +65,13 @@ class HistorianRows:
 
 @dataclass(slots=True)
 class ActuatorLimits:
-    """Limits between two points of the actuator; the defaults have no effect.
-
-    Attributes
-    ----------
-    rate_percent_per_s : float
-        Maximum speed.
-    band_percent, jump_percent : float
-        Stick-slip parameters S and J.
-    top_percent : float
-        Highest position.
-    slack_percent : float
-        Dead band of a loose linkage.
-    """
+    """Limits between two points of the actuator; the defaults have no effect."""
 
     rate_percent_per_s: float = np.inf
-    band_percent: float = 0.0
+    band_percent: float = 0.0  # stick-slip parameters S and J
     jump_percent: float = 0.0
     top_percent: float = np.inf
-    slack_percent: float = 0.0
+    slack_percent: float = 0.0  # full width of a loose linkage
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,38 +89,22 @@ class Hooks:
 
     The position sensor is between the two banks: the measured opening shows the
     effects of ``before_sensor`` (from command to sensor), but not those of
-    ``after_sensor`` (from sensor to plug).
-
-    Attributes
-    ----------
-    unit : UnitDescription
-        The unit without any effect.
-    length_s : float
-        Length of the recorded part.
-    forcing : list of callables
-        Each function changes the `LoopInputs` of every part of the run.
-    writing : list of callables
-        Each function changes the `HistorianRows` of every part of the run.
-    lead_s : float
-        Time by which the stamps of the power are earlier than those of other signals.
-    kappa_mpa_per_mw, critical_ratio : float
-        Back pressure per power (0: always choked) and critical pressure ratio.
-    reheater_share, reheater_s : float
-        Fraction of the power generated before the reheater, and its time constant.
+    ``after_sensor`` (from sensor to plug). ``forcing`` and ``writing`` change the rows
+    of every part of the run.
     """
 
-    unit: UnitDescription
-    length_s: float
+    unit: UnitDescription  # without any effect
+    length_s: float  # of the recorded part
     regions: tuple[Region, ...]
-    forcing: list[Callable[[LoopInputs], None]] = field(default_factory=list)
+    forcing: list[Callable[[LoopInputs], object]] = field(default_factory=list)
     writing: list[Callable[[HistorianRows], None]] = field(default_factory=list)
     before_sensor: ActuatorLimits = field(default_factory=ActuatorLimits)
     after_sensor: ActuatorLimits = field(default_factory=ActuatorLimits)
     added_curves: list[AddedCurve] = field(default_factory=list)
-    lead_s: float = 0.0
-    kappa_mpa_per_mw: float = 0.0
+    lead_s: float = 0.0  # by which the power is stamped earlier than other signals
+    kappa_mpa_per_mw: float = 0.0  # back pressure per power; 0: always choked
     critical_ratio: float = 0.546
-    reheater_share: float = 1.0
+    reheater_share: float = 1.0  # of the power, generated before the reheater
     reheater_s: float = 0.0
     _claimed: set[str] = field(default_factory=set)
 
@@ -124,18 +113,27 @@ class Hooks:
         """Return hooks without any effect."""
         return cls(unit, length_s, unit.regions)
 
-    def bank(self, before_sensor: float) -> ActuatorLimits:
-        """Return the bank on one side of the position sensor."""
+    def scale_power(self, factor: Change) -> None:
+        """Multiply x = F(u) by a factor in each row."""
+        self.forcing.append(lambda rows: np.multiply(rows.gain, factor(rows), out=rows.gain))
+
+    def add_power(self, part: Change) -> None:
+        """Add MW to the power in each row."""
+        self.forcing.append(lambda rows: np.add(rows.offset_mw, part(rows), out=rows.offset_mw))
+
+    def scale_input(self, factor: Change) -> None:
+        """Multiply u by a factor in each row."""
+        self.forcing.append(
+            lambda rows: np.multiply(rows.input_gain, factor(rows), out=rows.input_gain)
+        )
+
+    def bank(self, name: str, before_sensor: float) -> ActuatorLimits:
+        """Reserve, for an effect, the bank on one side of the position sensor."""
+        self.claim(name, 'before the sensor' if before_sensor else 'behind the sensor')
         return self.before_sensor if before_sensor else self.after_sensor
 
     def claim(self, name: str, place: str = '') -> None:
-        """Reserve a place that can have one setting only.
-
-        Raises
-        ------
-        InputError
-            The place is already reserved.
-        """
+        """Reserve a place that can have one setting only; raises `InputError` if it is taken."""
         key = f'{name} {place}'
         if key in self._claimed:
             where = f' {place}' if place else ''
@@ -152,20 +150,13 @@ TEN_DAYS_S = 10.0 * DAY_S
 
 ONSET = Parameter('t0_days', 5.0, 'd', 'When it happens, days after the first row.', 0.0, 400.0)
 BEFORE_SENSOR = Parameter(
-    'before_sensor',
-    0,
-    '',
-    '1: between command and position sensor; 0: between position sensor and plug.',
-    0,
-    1,
-)
+    'before_sensor', 0, '',
+    '1: between command and position sensor; 0: between position sensor and plug.', 0, 1,
+)  # fmt: skip
 SIGNAL = Parameter(
-    'signal',
-    'generated_power',
-    '',
-    'The signal whose record is faulty.',
+    'signal', 'generated_power', '', 'The signal whose record is faulty.',
     choices=tuple(info.topic for info in SIGNALS),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,45 +175,42 @@ class Values:
         return next(info.signal for info in SIGNALS if info.topic == topic)
 
 
-def _at_once(values: Values) -> float:
-    return 0.0
+def _starts(values: Values) -> float:
+    return float(dict(values.pairs).get('t0_days', 0.0))
 
 
-def at_onset(values: Values) -> float:
-    """Return the start of an effect that has the parameter `ONSET`, in days."""
-    return values['t0_days']
+def not_above(*pairs: tuple[str, str]) -> Callable[[Values], str]:
+    """Return a check that the first parameter of each pair does not exceed the second."""
+
+    def problem(values: Values) -> str:
+        said = (f'{low} must not exceed {top}' for low, top in pairs if values[low] > values[top])
+        return next(said, '')
+
+    return problem
 
 
-def _no_problem(values: Values) -> str:
-    return ''
+_no_problem = not_above()
 
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """A possible fault of a plant or of its record.
-
-    Attributes
-    ----------
-    name : str
-        Its name in the catalogue.
-    summary : str
-        One sentence.
-    parameters : tuple of Parameter
-        Defaults are a medium amplitude: detectable in ten days, hard to see by eye.
-    install : callable
-        Installs the effect with these values in the `Hooks` of a run.
-    starts_days : callable
-        Returns the time of its beginning; a run that ends before is refused.
-    problem : callable
-        Returns a conflict between the values, as the end of a sentence; empty if none.
-    """
+    """A possible fault of a plant or of its record."""
 
     name: str
     summary: str
+    # Defaults are a medium amplitude: detectable in ten days, hard to see by eye.
     parameters: tuple[Parameter, ...]
     install: Callable[[Values, Hooks], None]
-    starts_days: Callable[[Values], float] = _at_once
+    starts_days: Callable[[Values], float] = _starts  # a run that ends before is refused
+    # A conflict between the values, as the end of a sentence; empty if there is none.
     problem: Callable[[Values], str] = _no_problem
+
+
+def effect(
+    summary: str, *parameters: Parameter, **more: Any
+) -> Callable[[Callable[[Values, Hooks], None]], Effect]:
+    """Make an `Effect` of the function that installs it; it has the function's name."""
+    return lambda install: Effect(install.__name__, summary, parameters, install, **more)
 
 
 def ramp(time_s: FloatArray) -> FloatArray:

@@ -13,17 +13,15 @@ import numpy as np
 from valveflow_ros.errors import InputError
 from valveflow_ros.numerics import kernel
 from valveflow_ros.plant.thermal_unit import assignments
+from valveflow_ros.plant.unit import refuse_unless
 from valveflow_ros.records import NS_PER_S, BoolArray, FloatArray, IntArray
 
 RECORDINGS = ('1s', 'minute', 'compressed')
 # Spans of the transmitters, to which a dead band in % refers; that of a position is 100 %.
 SPANS = {
-    'main_steam_pressure_mpa': 25.0,
-    'main_steam_temperature_degc': 600.0,
-    'generated_power_mw': 400.0,
-    'condenser_pressure_kpa': 20.0,
-    'grid_frequency_hz': 2.0,
-}
+    'main_steam_pressure_mpa': 25.0, 'main_steam_temperature_degc': 600.0,
+    'generated_power_mw': 400.0, 'condenser_pressure_kpa': 20.0, 'grid_frequency_hz': 2.0,
+}  # fmt: skip
 _MINUTE = 60
 _OPTIONS = (
     'band_percent', 'scan_low_s', 'scan_high_s', 'longest_s', 'resample_s',
@@ -35,71 +33,45 @@ _OPTIONS = (
 class Historian:
     """How signals are recorded.
 
-    Attributes
-    ----------
-    recording : str
-        '1s': every sample. 'minute': the mean of each full minute of the record, stamped at
-        its end. 'compressed': a value is stored if a scan finds that it differs by more than
-        the dead band from the last stored one, or that the last one is too old.
-    band_percent : float
-        Dead band, % of the span in `SPANS`.
-    scan_low_s, scan_high_s : float
-        Each signal has its own scan interval in whole seconds, random between these limits.
-    longest_s : float
-        Maximum time between stored values; it is rounded down to a scan.
-    resample_s : float
-        For a compressed record: 0 gives each value at its own time; otherwise the step in whole
-        seconds of rows with the last stored values, from the time when all signals have one.
-    dropouts_per_day, dropout_minutes : float
-        Number of dropouts of a signal per day, and their mean duration.
+    ``recording`` '1s': every sample. 'minute': the mean of each full minute of the record, stamped
+    at its end. 'compressed': a value is stored if a scan finds that it differs by more than the
+    dead band from the last stored one, or that the last one is too old.
     """
 
     recording: str = '1s'
-    band_percent: float = 0.5
+    band_percent: float = 0.5  # dead band, % of the span in `SPANS`
+    # Each signal has its own scan interval in whole seconds, random between these limits.
     scan_low_s: float = 5.0
     scan_high_s: float = 30.0
-    longest_s: float = 600.0
+    longest_s: float = 600.0  # between stored values; it is rounded down to a scan
+    # Of a compressed record: 0 gives each value at its own time; otherwise the step in whole
+    # seconds of rows with the last stored values, from the time when all signals have one.
     resample_s: float = 0.0
-    dropouts_per_day: float = 0.0
-    dropout_minutes: float = 30.0
+    dropouts_per_day: float = 0.0  # of each signal
+    dropout_minutes: float = 30.0  # their mean duration
 
     def __post_init__(self) -> None:
-        """Check the options."""
         if self.recording not in RECORDINGS:
             raise InputError(
                 f"There is no recording '{self.recording}': use one of {', '.join(RECORDINGS)}."
             )
         checks = (
             (0.0 <= self.band_percent <= 50.0, 'band_percent must be 0 to 50 %'),
-            (
-                1.0 <= self.scan_low_s <= self.scan_high_s <= 600.0,
-                'scans must be 1 to 600 s and the shortest not above the longest',
-            ),
+            (1.0 <= self.scan_low_s <= self.scan_high_s <= 600.0,
+             'scans must be 1 to 600 s and the shortest not above the longest'),
             (self.longest_s >= self.scan_high_s, 'longest_s must not be below scan_high_s'),
-            (
-                0.0 <= self.resample_s <= 3600.0 and self.resample_s == self.resample_s // 1,
-                'resample_s must be whole seconds, 0 to 3600',
-            ),
-            (
-                self.resample_s == 0.0 or self.recording == 'compressed',
-                "resample_s belongs to the recording 'compressed'",
-            ),
+            (0.0 <= self.resample_s <= 3600.0 and self.resample_s == self.resample_s // 1,
+             'resample_s must be whole seconds, 0 to 3600'),
+            (self.resample_s == 0.0 or self.recording == 'compressed',
+             "resample_s belongs to the recording 'compressed'"),
             (0.0 <= self.dropouts_per_day <= 100.0, 'dropouts_per_day must be 0 to 100'),
             (0.0 < self.dropout_minutes <= 10_000.0, 'dropout_minutes: above 0, at most 10000'),
-        )
-        for good, sentence in checks:
-            if not good:
-                raise InputError(f'This recording cannot be made: {sentence}.')
+        )  # fmt: skip
+        refuse_unless('recording cannot be made', *checks)
 
     @classmethod
     def parse(cls, text: str) -> Historian:
-        """Read ``NAME`` or ``NAME:key=value,...``; the keys are the attributes.
-
-        Raises
-        ------
-        InputError
-            Unknown name or key, or a value out of range.
-        """
+        """Read ``NAME`` or ``NAME:key=value,...``; the keys are the attributes."""
         name, _, rest = text.strip().partition(':')
         given: dict[str, Any] = assignments(rest, f"Recording '{name}'", _OPTIONS)
         return cls(name, **given)
@@ -112,23 +84,10 @@ class Historian:
     def record(
         self, start_ns: int, signals: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> tuple[IntArray, dict[str, FloatArray]]:
-        """Record signals that were sampled every second.
+        """Return times, int64 (m,), and columns of signals (n,) that were sampled every second.
 
-        Parameters
-        ----------
-        start_ns : int
-            Time of the first sample.
-        signals : mapping of str to float64 (n,)
-            Signals by column; not changed.
-        rng : numpy.random.Generator
-            Used for scans and dropouts; the number of draws is the same for all recordings.
-
-        Returns
-        -------
-        time_ns : int64 (m,)
-            Increasing.
-        columns : dict of float64 (m,)
-            NaN if a value is missing or, with own times, if there is no new value.
+        NaN means that a value is missing or, with own times, that there is no new value. The
+        number of random draws, for scans and dropouts, is the same for all recordings.
         """
         there = self._there(signals, rng)
         scans = self._scans(signals, rng)
@@ -138,23 +97,17 @@ class Historian:
         elif self.recording == 'minute':
             seconds, columns = _minutes(there)
         else:
-            kept = {
-                name: exceptions(
-                    column, *scans[name], self._band(name), round(self.longest_s)
-                )
-                for name, column in there.items()
-            }  # fmt: skip
+            kept = {}
+            for name, column in there.items():
+                band = self.band_percent / 100.0 * SPANS.get(name, 100.0)
+                kept[name] = exceptions(column, *scans[name], band, round(self.longest_s))
             seconds, columns = self._rows(there, kept)
         return start_ns + seconds * NS_PER_S, columns
-
-    def _band(self, name: str) -> float:
-        return self.band_percent / 100.0 * SPANS.get(name, 100.0)
 
     def _there(
         self, signals: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> dict[str, FloatArray]:
-        """Return the signals with NaN in dropouts."""
-        n, out = _length(signals), {}
+        n, out, pause_s = _length(signals), {}, 86_400.0 / max(self.dropouts_per_day, 1e-9)
         for name, column in signals.items():
             # Each signal has its own generator: dropouts of one do not change those of another.
             mine = np.random.default_rng(rng.integers(2**63))
@@ -162,11 +115,11 @@ class Historian:
             if self.dropouts_per_day == 0.0:
                 continue
             out[name] = column.copy()
-            now = mine.exponential(86_400.0 / self.dropouts_per_day)
+            now = mine.exponential(pause_s)
             while now < n:
                 end = now + mine.exponential(60.0 * self.dropout_minutes)
                 out[name][int(now) : int(end) + 1] = np.nan
-                now = end + mine.exponential(86_400.0 / self.dropouts_per_day)
+                now = end + mine.exponential(pause_s)
         return out
 
     def _scans(
@@ -199,10 +152,9 @@ class Historian:
         seconds = np.arange(-(-begin // step) * step, _length(signals), step, dtype=np.int64)
         columns = {}
         for name, column in signals.items():
-            places = np.flatnonzero(kept[name])
-            last = np.searchsorted(places, seconds, side='right') - 1
-            values = column[places] if places.size else np.array([np.nan])
-            columns[name] = np.where(last >= 0, values[np.maximum(last, 0)], np.nan)
+            stored = np.where(kept[name], np.arange(column.size), -1)
+            last = np.maximum.accumulate(stored)[seconds]
+            columns[name] = np.where(last >= 0, column[last], np.nan)
         return seconds, columns
 
 
@@ -211,7 +163,6 @@ def _length(signals: Mapping[str, FloatArray]) -> int:
 
 
 def _minutes(signals: dict[str, FloatArray]) -> tuple[IntArray, dict[str, FloatArray]]:
-    """Return the means of the values in full minutes, stamped at the end of each minute."""
     count = _length(signals) // _MINUTE
     columns = {}
     for name, column in signals.items():

@@ -23,17 +23,10 @@ N_POSITIONS = 3
 
 def settings(bank: ActuatorLimits, step_s: float) -> FloatArray:
     """Return the settings of `move`: largest step, slip-off, slip-to, top, half slack."""
-    off = (bank.band_percent + bank.jump_percent) / 2.0
-    to = (bank.band_percent - bank.jump_percent) / 2.0
-    return np.array(
-        [
-            bank.rate_percent_per_s * step_s,
-            off,
-            to,
-            bank.top_percent,
-            bank.slack_percent / 2.0,
-        ]
-    )
+    return np.array([
+        bank.rate_percent_per_s * step_s, (bank.band_percent + bank.jump_percent) / 2.0,
+        (bank.band_percent - bank.jump_percent) / 2.0, bank.top_percent, bank.slack_percent / 2.0,
+    ])  # fmt: skip
 
 
 @jit
@@ -266,7 +259,6 @@ class Memory(NamedTuple):
 def _command(
     load: float, move: float, density: float, correction: float, flow: FlowLaw, manual: float
 ) -> float:
-    """Return the opening that the controller commands, in %."""
     wanted = move
     if manual == 0.0:
         u = interpolate(load, flow.curve_x, flow.curve_u) + correction
@@ -276,7 +268,6 @@ def _command(
 
 @jit
 def _corrected(correction: float, load: float, error: float, control: FloatArray) -> float:
-    """Integrate the error of the power control in MW to a correction of u."""
     if control[0] == 0.0:
         return correction
     if load < control[2]:
@@ -322,8 +313,18 @@ class ClosedLoop:
     """Valve, turbine and power control, run part by part; it begins in steady state."""
 
     def __init__(self, hooks: Hooks, manual: bool) -> None:
-        lags, self._depth = lag_table(hooks.regions, hooks.unit.sample_period_s)
-        self._law = _law(hooks, lags, manual)
+        plan, h = hooks.unit.programme, hooks.unit.sample_period_s
+        lags, self._depth = lag_table(hooks.regions, h)
+        share = h / plan.feedback_s if plan.feedback and not manual else 0.0
+        control = (
+            share / plan.feedback_slope_mw, plan.feedback_limit_u, plan.feedback_off_above_mw,
+            share, float(manual),
+        )  # fmt: skip
+        reheater = (1.0 - hooks.reheater_share, *lag_coefficients(hooks.reheater_s, h))
+        self._law = Law(
+            flow_law(hooks), np.array(control), lags, np.array(reheater),
+            settings(hooks.before_sensor, h), settings(hooks.after_sensor, h),
+        )  # fmt: skip
         self._memory: Memory | None = None
         self._past = np.empty(0)
 
@@ -338,7 +339,6 @@ class ClosedLoop:
         return Motion(*out)
 
     def _begin(self, series: Series) -> Memory:
-        """Return the steady state of a plant at the first load."""
         load = float(series.load[0])
         self._past = np.full(self._depth, load)
         opening = _command(
@@ -346,25 +346,3 @@ class ClosedLoop:
         )
         resting = np.full(N_POSITIONS, opening)
         return Memory(np.array([0.0, load, load]), resting, resting.copy())
-
-
-def _law(hooks: Hooks, lags: FloatArray, manual: bool) -> Law:
-    """Return the constants of a run."""
-    plan, h = hooks.unit.programme, hooks.unit.sample_period_s
-    share = h / plan.feedback_s if plan.feedback and not manual else 0.0
-    control = (
-        share / plan.feedback_slope_mw,
-        plan.feedback_limit_u,
-        plan.feedback_off_above_mw,
-        share,
-        float(manual),
-    )
-    reheater = (1.0 - hooks.reheater_share, *lag_coefficients(hooks.reheater_s, h))
-    return Law(
-        flow_law(hooks),
-        np.array(control),
-        lags,
-        np.array(reheater),
-        settings(hooks.before_sensor, h),
-        settings(hooks.after_sensor, h),
-    )

@@ -116,9 +116,7 @@ class Outside:
 class Drive(Protocol):
     """The operation of the unit: load programme or manual opening."""
 
-    @property
-    def manual(self) -> bool:
-        """Return True if the opening is set by hand and the power control is off."""
+    manual: bool  # the opening is set by hand and the power control is off
 
     def advance(self, first: int, count: int) -> Outside:
         """Return rows ``[first, first + count)``; must be called in the order of the rows."""
@@ -190,10 +188,11 @@ class Pulses:
 class LoadProgramme:
     """The unit under power control, as in section IV of the paper and with frequency control."""
 
+    manual = False
+
     def __init__(self, unit: UnitDescription, seed: int, length_s: float, clock_s: float) -> None:
         plan, h = unit.programme, unit.sample_period_s
-        self._plan = plan
-        self._step_s = h
+        self._plan, self._step_s = plan, h
         self._knots = load_knots(generator(seed, ChanceSource.LOAD), length_s, clock_s, plan)
         self._pulses = Pulses.draw(generator(seed, ChanceSource.PULSES), length_s, plan)
         self._sliding = LowPass(plan.pressure_lag_s, h)
@@ -203,11 +202,6 @@ class LoadProgramme:
             generator(seed, ChanceSource.TEMPERATURE), plan.temperature_wander_s, h
         )
         self._jitter = Wander(generator(seed, ChanceSource.JITTER), plan.jitter_s, h)
-
-    @property
-    def manual(self) -> bool:
-        """Return False, because the power control is on."""
-        return False
 
     def advance(self, first: int, count: int) -> Outside:
         """Return rows ``[first, first + count)``."""
@@ -285,15 +279,15 @@ class Plant:
     def __init__(
         self, hooks: Hooks, drive: Drive, seed: int, first_row: int, clock_s: float
     ) -> None:
-        self._hooks = hooks
-        self._drive = drive
+        self._hooks, self._drive, self._clock_s = hooks, drive, clock_s
         self._row = self._first_row = first_row
-        self._clock_s = clock_s
         self._loop = ClosedLoop(hooks, drive.manual)
         self._disturbance = Disturbance(hooks.unit, seed)
-        self._opening = generator(seed, ChanceSource.OPENING_SENSOR)
-        self._pressure = generator(seed, ChanceSource.PRESSURE_SENSOR)
-        self._temperature = generator(seed, ChanceSource.TEMPERATURE_SENSOR)
+        self._sensors = [
+            generator(seed, source)
+            for source in (ChanceSource.OPENING_SENSOR, ChanceSource.PRESSURE_SENSOR,
+                           ChanceSource.TEMPERATURE_SENSOR)
+        ]  # fmt: skip
 
     def advance(self, count: int) -> PlantRows:
         """Return the next ``count`` rows."""
@@ -301,41 +295,21 @@ class Plant:
         outside = self._drive.advance(self._row - self._first_row, count)
         time_s = np.arange(self._row, self._row + count, dtype=np.float64) * unit.sample_period_s
         self._row += count
-        forcing = LoopInputs(
-            time_s,
-            np.mod(self._clock_s + time_s, DAY_S),
-            outside.pressure_mpa,
+        forcing = LoopInputs.forced(
+            hooks, time_s, np.mod(self._clock_s + time_s, DAY_S), outside.pressure_mpa,
             outside.temperature_degc,
-            np.ones(count),
-            np.ones(count),
-            np.zeros(count),
-        )
-        for change in hooks.forcing:
-            change(forcing)
+        )  # fmt: skip
         noise_mw = self._disturbance.advance(outside.load_mw)
-        motion = self._loop.advance(
-            Series(
-                time_s,
-                outside.load_mw,
-                outside.pressure_mpa,
-                outside.pressure_mpa**unit.pressure_exponent,
-                outside.moves_percent,
-                noise_mw,
-                forcing.gain,
-                forcing.input_gain,
-                forcing.offset_mw,
-            )
-        )
-        sensors = unit.noise
+        motion = self._loop.advance(Series(
+            time_s, outside.load_mw, outside.pressure_mpa,
+            outside.pressure_mpa**unit.pressure_exponent, outside.moves_percent, noise_mw,
+            forcing.gain, forcing.input_gain, forcing.offset_mw,
+        ))  # fmt: skip
+        sizes = unit.noise
+        opening, pressure, temperature = (s.standard_normal(count) for s in self._sensors)
         return PlantRows(
-            motion.command,
-            motion.sensor + sensors.opening_percent * self._opening.standard_normal(count),
-            outside.pressure_mpa + sensors.pressure_mpa * self._pressure.standard_normal(count),
-            outside.temperature_degc
-            + sensors.temperature_k * self._temperature.standard_normal(count),
-            motion.power,
-            noise_mw,
-            outside.load_mw,
-            motion.plug,
-            motion.u,
-        )
+            motion.command, motion.sensor + sizes.opening_percent * opening,
+            outside.pressure_mpa + sizes.pressure_mpa * pressure,
+            outside.temperature_degc + sizes.temperature_k * temperature, motion.power, noise_mw,
+            outside.load_mw, motion.plug, motion.u,
+        )  # fmt: skip

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,79 +21,50 @@ from valveflow_ros.records import NS_PER_S, FloatArray, SampleTable, Signal
 # The historian's record of a plant: stamps, rounding, faults of the record.
 
 DECIMALS = {
-    Signal.VALVE_OPENING: 2,
-    Signal.MAIN_STEAM_PRESSURE: 3,
-    Signal.MAIN_STEAM_TEMPERATURE: 1,
-    Signal.GENERATED_POWER: 2,
-    Signal.VALVE_COMMAND: 2,
-}
+    Signal.VALVE_OPENING: 2, Signal.MAIN_STEAM_PRESSURE: 3, Signal.MAIN_STEAM_TEMPERATURE: 1,
+    Signal.GENERATED_POWER: 2, Signal.VALVE_COMMAND: 2,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedLog:
-    """The record of the instruments, and the true values.
+    """The record of the instruments, and the true values; float64 (n,) each.
 
     If the power is stamped early or late (`clock`), its true value and its
     noise are in the rows of the stamps. So without faults of the record, the
     power in the table is ``true_power_mw + noise_mw``, rounded.
-
-    Attributes
-    ----------
-    table : SampleTable
-        Opening, pressure, temperature, power and command, rounded as in a historian.
-        The command is the output of the controller, before the actuator.
-    true_u : float64 (n,)
-        The true integrated input of the curve, % MPa^m.
-    true_power_mw : float64 (n,)
-        Power without noise.
-    load_mw : float64 (n,)
-        The load set point.
-    unit : UnitDescription
-        The unit that was simulated, without its effects.
-    noise_mw : float64 (n,)
-        The random disturbance of the power.
-    plug_percent : float64 (n,)
-        The true position of the plug.
-    active : tuple of EffectSpec
-        The effects switched on, with the values of all parameters.
     """
 
+    # Opening, pressure, temperature, power and command, rounded as in a historian; the
+    # command is the output of the controller, before the actuator.
     table: SampleTable
-    true_u: FloatArray
-    true_power_mw: FloatArray
-    load_mw: FloatArray
-    unit: UnitDescription
+    true_u: FloatArray  # integrated input of the curve, % MPa^m
+    true_power_mw: FloatArray  # without noise
+    load_mw: FloatArray  # the set point
+    unit: UnitDescription  # without its effects
     noise_mw: FloatArray
-    plug_percent: FloatArray
+    plug_percent: FloatArray  # the true position
     active: tuple[EffectSpec, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return len(self.table)
 
     @classmethod
     def joined(cls, parts: list[SimulatedLog]) -> SimulatedLog:
         """Join the parts of one run."""
-        first = parts[0]
-        return cls(
-            SampleTable.concatenate([part.table for part in parts]),
-            np.concatenate([part.true_u for part in parts]),
-            np.concatenate([part.true_power_mw for part in parts]),
-            np.concatenate([part.load_mw for part in parts]),
-            first.unit,
-            np.concatenate([part.noise_mw for part in parts]),
-            np.concatenate([part.plug_percent for part in parts]),
-            first.active,
-        )
+        names = ('true_u', 'true_power_mw', 'load_mw', 'noise_mw', 'plug_percent')
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(p, name) for p in parts]) for name in names
+        }
+        table = SampleTable.concatenate([part.table for part in parts])
+        return replace(parts[0], table=table, **columns)
 
 
 class Recorder:
     """Convert the rows of a plant into tables, with early stamps of the power if required."""
 
     def __init__(self, hooks: Hooks, start_ns: int, active: tuple[EffectSpec, ...]) -> None:
-        self._hooks = hooks
-        self._start_ns = start_ns
-        self._active = active
+        self._hooks, self._start_ns, self._active = hooks, start_ns, active
         self._shift = hooks.lead_s / hooks.unit.sample_period_s
         self.ahead = max(0, math.ceil(self._shift))
         self.behind = max(0, math.ceil(-self._shift))
@@ -130,7 +102,6 @@ class Recorder:
         return SimulatedLog(table, rows.u, power, rows.load, unit, noise, rows.plug, self._active)
 
     def _stamped(self, column: FloatArray, count: int) -> FloatArray:
-        """Return the values with the stamps of the rows, by linear interpolation."""
         whole = math.floor(self._shift)
         part = self._shift - whole
         first = self.behind + whole
@@ -140,67 +111,40 @@ class Recorder:
         return column[first : first + count] * (1.0 - part) + later * part
 
 
-__all__ = ['DEFAULT_START_NS', 'WARM_UP_S', 'SimulatedLog', 'simulate', 'simulate_parts']
-
 WARM_UP_S = 3600.0
 LONGEST_DAYS = 400.0
 DEFAULT_START_NS = 1_700_006_400 * NS_PER_S  # 2023-11-15 00:00:00 UTC, a midnight
 
 
 def simulate(
-    days: float,
-    seed: int,
-    unit: UnitDescription | None = None,
-    start_ns: int = DEFAULT_START_NS,
-    effects: Sequence[EffectSpec] = (),
-) -> SimulatedLog:
-    """Simulate ``days`` of operation.
+    days: float, seed: int, unit: UnitDescription | None = None,
+    start_ns: int = DEFAULT_START_NS, effects: Sequence[EffectSpec] = (),
+) -> SimulatedLog:  # fmt: skip
+    """Simulate ``days`` of operation, at most 400, of the paper's unit or another one.
 
-    Parameters
-    ----------
-    days : float
-        Duration, more than 0 and at most 400.
-    seed : int
-        It determines every random number. The numbers do not depend on the effects,
-        and a longer run begins with the shorter one.
-    unit : UnitDescription, optional
-        Defaults to the unit of the paper's simulation study.
-    start_ns : int
-        Time of the first row, ns since 1970; it determines the time of day in UTC.
-    effects : sequence of EffectSpec
-        Effects to switch on; their order has no influence.
+    The seed determines every random number; they do not depend on the effects, whose order has no
+    influence, and a longer run begins with the shorter one. ``start_ns`` determines the time of
+    day in UTC. A row needs about 90 bytes, and twice this while the parts are joined: ten days at
+    1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`.
 
     Raises
     ------
     InputError
         ``days``, ``seed`` or ``start_ns`` is out of range, or effects cannot
         act in this run or not together.
-
-    Notes
-    -----
-    A row needs about 90 bytes, and twice this while the parts are joined: ten days
-    at 1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`.
     """
     return SimulatedLog.joined(list(simulate_parts(days, seed, unit, start_ns, effects)))
 
 
 def simulate_parts(
-    days: float,
-    seed: int,
-    unit: UnitDescription | None = None,
-    start_ns: int = DEFAULT_START_NS,
-    effects: Sequence[EffectSpec] = (),
-    part_s: float = DAY_S,
-) -> Iterator[SimulatedLog]:
+    days: float, seed: int, unit: UnitDescription | None = None,
+    start_ns: int = DEFAULT_START_NS, effects: Sequence[EffectSpec] = (), part_s: float = DAY_S,
+) -> Iterator[SimulatedLog]:  # fmt: skip
     """Simulate as `simulate` does and yield the run in consecutive parts of ``part_s``.
 
     The state continues from part to part: the joined parts are equal to the result
     of `simulate`, bit for bit, for any ``part_s``. One part is in memory at a time.
-
-    Raises
-    ------
-    InputError
-        Raised at the call, before the simulation; see `simulate`.
+    Errors are raised at the call, before the simulation.
     """
     unit = unit or UnitDescription()
     if not 0.0 < days <= LONGEST_DAYS:
@@ -222,13 +166,7 @@ def simulate_parts(
 
 
 def prepare(hooks: Hooks, seed: int, start_ns: int, effects: Sequence[EffectSpec]) -> Recorder:
-    """Check the arguments of a run, install the effects, and return the recorder.
-
-    Raises
-    ------
-    InputError
-        See `simulate`.
-    """
+    """Check the arguments of a run as `simulate`, install the effects, return the recorder."""
     if seed < 0:
         raise InputError(f'The seed must be 0 or more, not {seed}.')
     end_ns = start_ns + round(hooks.length_s * NS_PER_S)

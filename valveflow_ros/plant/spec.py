@@ -69,10 +69,7 @@ class EffectSpec:
     def of(cls, effect: Effect | str, **given: Value) -> EffectSpec:
         """Set parameters by keyword; ``effect`` may also be one outside the catalogue.
 
-        Raises
-        ------
-        InputError
-            As in `parse`.
+        Raises `InputError` as `parse`.
         """
         if isinstance(effect, str):
             effect = _lookup(effect, catalogue())
@@ -93,13 +90,9 @@ class EffectSpec:
 def install(specs: Sequence[EffectSpec], hooks: Hooks) -> None:
     """Install effects in the hooks of a run, in the order of their names.
 
-    The order in which they were given has no influence, so that a set of
-    effects always gives the same plant, bit for bit.
-
-    Raises
-    ------
-    InputError
-        An effect begins after the end of the run, or two effects need the same place.
+    The order in which they were given has no influence, so that a set of effects always gives the
+    same plant, bit for bit. Raises `InputError` if an effect begins after the end of the run, or
+    two effects need the same place.
     """
     for spec in sorted(specs, key=str):
         start, days = spec.effect.starts_days(spec.values), hooks.length_s / DAY_S

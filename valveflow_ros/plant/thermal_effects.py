@@ -14,15 +14,7 @@ from dataclasses import dataclass, field
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import (
-    ONSET,
-    Effect,
-    Hooks,
-    Values,
-    at_onset,
-    ramp,
-    step,
-)
+from valveflow_ros.plant.effect import ONSET, Effect, Hooks, Values, effect, ramp, step
 from valveflow_ros.plant.effects import catalogue
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import UnitDescription
@@ -39,21 +31,12 @@ Change = Callable[[FloatArray], FloatArray]
 
 @dataclass(slots=True)
 class ThermalHooks(Hooks):
-    """The places of `Hooks`, and three more.
+    """The places of `Hooks`, and three more; functions of the seconds since the first row."""
 
-    Attributes
-    ----------
-    area : list of callables
-        Each function returns a factor on the steam area at seconds since the first row.
-    position_zero : list of callables
-        Each function returns the error of the position sensor in %, positive if too high.
-    pressure_factor : float
-        Measured pressure divided by true pressure.
-    """
-
-    area: list[Change] = field(default_factory=list)
+    area: list[Change] = field(default_factory=list)  # factors on the steam area
+    # Errors of the position sensor in %, positive if too high.
     position_zero: list[Change] = field(default_factory=list)
-    pressure_factor: float = 1.0
+    pressure_factor: float = 1.0  # measured divided by true pressure
 
     @classmethod
     def for_run(cls, length_s: float) -> ThermalHooks:
@@ -63,76 +46,53 @@ class ThermalHooks(Hooks):
 
 
 def _thermal(hooks: Hooks) -> ThermalHooks:
-    """Return the hooks as those of a thermal unit."""
     if not isinstance(hooks, ThermalHooks):
         raise InputError('This effect acts on a thermal unit only; choose one with unit=...')
     return hooks
 
 
-def _install_area_step(values: Values, hooks: Hooks) -> None:
+@effect(
+    'The steam area belonging to an opening changes at one moment.',
+    Parameter('g', 0.01, '', 'Relative change.', -0.3, 0.3),
+    ONSET,
+)
+def area_step(values: Values, hooks: Hooks) -> None:
     """Multiply the area by 1 + g from t0 on: worn seats, a broken part, an overhaul."""
     _thermal(hooks).area.append(lambda time_s: 1.0 + values['g'] * step(time_s, values))
 
 
-AREA_STEP = Effect(
-    'area_step',
-    'The steam area belonging to an opening changes at one moment.',
-    (Parameter('g', 0.01, '', 'Relative change.', -0.3, 0.3), ONSET),
-    _install_area_step,
-    starts_days=at_onset,
-)
-
-
-def _install_opening_offset(values: Values, hooks: Hooks) -> None:
-    """Add b + d t / 10 d to the measured position; the servo controls the measured value."""
-
-    def change(time_s: FloatArray) -> FloatArray:
-        return values['b_percent'] + values['drift_percent'] * ramp(time_s)
-
-    _thermal(hooks).position_zero.append(change)
-
-
-OPENING_OFFSET = Effect(
-    'opening_offset',
+@effect(
     'The position sensor reads too high by a fixed or drifting amount.',
-    (
-        Parameter('b_percent', 0.5, '%', 'What it reads too high at first.', -10.0, 10.0),
-        Parameter('drift_percent', 0.0, '%/(10 d)', 'Change in ten days.', -10.0, 10.0),
-    ),
-    _install_opening_offset,
+    Parameter('b_percent', 0.5, '%', 'What it reads too high at first.', -10.0, 10.0),
+    Parameter('drift_percent', 0.0, '%/(10 d)', 'Change in ten days.', -10.0, 10.0),
 )
+def opening_offset(values: Values, hooks: Hooks) -> None:
+    """Add b + d t / 10 d to the measured position; the servo controls the measured value."""
+    _thermal(hooks).position_zero.append(
+        lambda time_s: values['b_percent'] + values['drift_percent'] * ramp(time_s)
+    )
 
 
-def _install_pressure_scale(values: Values, hooks: Hooks) -> None:
+@effect(
+    'The pressure sensor reads too high by a share.',
+    Parameter('g', 0.01, '', 'Relative error.', -0.2, 0.2),
+)
+def pressure_scale(values: Values, hooks: Hooks) -> None:
     """Multiply the measured pressure by 1 + g, for the record and for the control."""
     hooks.claim('pressure_scale')
     _thermal(hooks).pressure_factor = 1.0 + values['g']
 
 
-PRESSURE_SCALE = Effect(
-    'pressure_scale',
-    'The pressure sensor reads too high by a share.',
-    (Parameter('g', 0.01, '', 'Relative error.', -0.2, 0.2),),
-    _install_pressure_scale,
-)
-
-_OWN = (AREA_STEP, OPENING_OFFSET, PRESSURE_SCALE)
-
-
 def thermal_catalogue() -> dict[str, Effect]:
     """Return all effects of a thermal unit by name, in alphabetical order."""
-    shared = {name: catalogue()[name] for name in _SHARED}
-    own = {effect.name: effect for effect in _OWN}
-    return dict(sorted((shared | own).items()))
+    own = {effect.name: effect for effect in (area_step, opening_offset, pressure_scale)}
+    return dict(sorted(({name: catalogue()[name] for name in _SHARED} | own).items()))
 
 
 def thermal_effect(given: str | EffectSpec, kind: str) -> EffectSpec:
     """Return an effect from its text, after checking that it can act on a thermal unit.
 
-    Raises
-    ------
-    InputError
-        As in `EffectSpec.parse`, or an effect that only acts on the paper's curve or regions.
+    Raises `InputError` as `EffectSpec.parse`, and for one of the paper's curve or regions.
     """
     known = thermal_catalogue()
     name = given.partition(':')[0].strip() if isinstance(given, str) else given.name

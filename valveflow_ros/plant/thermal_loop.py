@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.numerics import jit, kernel
-from valveflow_ros.plant.loop import lag_coefficients
+from valveflow_ros.plant.loop import lag_coefficients, settings
 from valveflow_ros.plant.thermal_effects import ThermalHooks
 from valveflow_ros.plant.thermal_unit import TABLE_STEP_PERCENT, ThermalUnit
 from valveflow_ros.records import FloatArray
@@ -65,17 +65,9 @@ class TrueRows(NamedTuple):
     power: FloatArray
     condenser: FloatArray
 
-    def part(self, start: int, end: int) -> TrueRows:
-        """Return rows ``[start, end)``."""
-        return TrueRows(*(column[start:end] for column in self))
-
 
 class Law(NamedTuple):
-    """The constants of a run; lags are (a, b, c) of `lag_coefficients`.
-
-    ``bank_*`` are (largest step, slip-off, slip-to, top, half slack) of the parts before and
-    after the position sensor.
-    """
+    """The constants of a run; lags are (a, b, c) of `lag_coefficients`, banks `settings`."""
 
     area: FloatArray
     opening_of: FloatArray  # the governor's inverse of the area, on a grid of `inverse_step`
@@ -97,8 +89,8 @@ class Law(NamedTuple):
     integral_s: float
     vacuum_per_kpa: float
     water_reference: float
-    bank_before: tuple[float, float, float, float, float]
-    bank_behind: tuple[float, float, float, float, float]
+    bank_before: FloatArray  # from the command to the position sensor
+    bank_behind: FloatArray
 
 
 def law_of(unit: ThermalUnit, hooks: ThermalHooks) -> Law:
@@ -110,13 +102,8 @@ def law_of(unit: ThermalUnit, hooks: ThermalHooks) -> Law:
     at_points = np.interp(points, known, area)
     rising = np.append(True, np.diff(at_points) > 1e-6)
     grid = np.linspace(0.0, float(at_points[-1]), 1024)
-    banks = []
-    for bank in (hooks.before_sensor, hooks.after_sensor):
-        off = (bank.band_percent + bank.jump_percent) / 2.0
-        to = (bank.band_percent - bank.jump_percent) / 2.0
-        step = bank.rate_percent_per_s
-        banks.append((step, off, to, bank.top_percent, bank.slack_percent / 2.0))
-    banks[0] = (min(banks[0][0], _SERVO_PERCENT_PER_S), *banks[0][1:])
+    before = settings(hooks.before_sensor, 1.0)
+    before[0] = min(before[0], _SERVO_PERCENT_PER_S)
     return Law(
         area, np.interp(grid, at_points[rising], points[rising]), float(grid[1]),
         unit.on_opening, unit.exponent, unit.pressure_rated_mpa, hooks.pressure_factor,
@@ -124,7 +111,7 @@ def law_of(unit: ThermalUnit, hooks: ThermalHooks) -> Law:
         math.exp(-1.0 / unit.actuator_s), lag_coefficients(unit.high_pressure_s, 1.0),
         lag_coefficients(unit.reheater_s, 1.0), math.exp(-1.0 / unit.mill_s),
         lag_coefficients(unit.fuel_s, 1.0), unit.storage_s, unit.drop, unit.integral_s,
-        unit.vacuum_per_kpa, unit.water_degc, *banks,
+        unit.vacuum_per_kpa, unit.water_degc, before, settings(hooks.after_sensor, 1.0),
     )  # fmt: skip
 
 
@@ -137,13 +124,12 @@ def _at(table: FloatArray, step: float, x: float) -> float:
 
 
 @jit
-def _saturation_kpa(degc: float) -> float:
-    """Return the saturation pressure of water (Magnus)."""
+def _saturation_kpa(degc: float) -> float:  # of water, by Magnus
     return float(0.61094 * np.exp(17.625 * degc / (degc + 243.04)))
 
 
 @jit
-def _through(wanted: float, memory: FloatArray, bank: tuple[float, ...]) -> float:
+def _through(wanted: float, memory: FloatArray, bank: FloatArray) -> float:
     """Return the position after servo speed, friction, stop and slack; ``memory`` is (6,).
 
     Friction has two states: the stem is at rest until the force exceeds (S + J) / 2 and slips by
@@ -168,7 +154,6 @@ def _through(wanted: float, memory: FloatArray, bank: tuple[float, ...]) -> floa
 
 @jit
 def _governor_opening(flow: float, density: float, law: Law) -> float:
-    """Return the opening of the governor's table for a flow."""
     if law.on_opening:
         opening = _at(law.opening_of, law.inverse_step, flow / density)
     else:
@@ -178,7 +163,6 @@ def _governor_opening(flow: float, density: float, law: Law) -> float:
 
 @jit
 def _flow(plug: float, pressure: float, law: Law) -> float:
-    """Return the steam flow as a fraction of the full flow."""
     density = (pressure / law.rated_pressure) ** law.exponent
     if law.on_opening:
         return float(density * _at(law.area, TABLE_STEP_PERCENT, plug))

@@ -51,39 +51,23 @@ _NOMINAL_HZ = 50.0
 
 @dataclass(frozen=True, slots=True)
 class ThermalLog:
-    """The record of a thermal unit, and the true values.
+    """The record of a thermal unit, and the true values of every second; float64 (n,) each.
 
-    Attributes
-    ----------
-    table : SampleTable
-        The five signals. If values have their own times, NaN means no new value.
-    extra : dict of float64 (n,)
-        Further columns of the same rows: ``condenser_pressure_kpa``, ``grid_frequency_hz``,
-        and ``valve_1_position_percent`` and so on of valves in sequence.
-    unit : ThermalUnit
-        The unit without its effects.
-    historian : Historian
-        How it was recorded.
-    truth : TrueRows
-        True values of every second from the first sample on, for any recording.
-    demand_mw, temperature_degc, water_degc : float64 (n,)
-        Set point after the rate limit, true steam and cooling water temperature, every second.
-    active : tuple of EffectSpec
-        The effects switched on.
+    ``extra`` are further columns of the rows of the table: ``condenser_pressure_kpa``,
+    ``grid_frequency_hz``, and ``valve_1_position_percent`` and so on of valves in sequence.
     """
 
-    table: SampleTable
+    table: SampleTable  # if values have their own times, NaN means no new value
     extra: dict[str, FloatArray]
-    unit: ThermalUnit
+    unit: ThermalUnit  # without its effects
     historian: Historian
     truth: TrueRows
-    demand_mw: FloatArray
+    demand_mw: FloatArray  # the set point after the rate limit
     temperature_degc: FloatArray
     water_degc: FloatArray
     active: tuple[EffectSpec, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return len(self.table)
 
     @property
@@ -106,11 +90,8 @@ class ThermalLog:
         pressure; its ``knees`` are in % for the form 'opening', in % MPa^m for
         'integrated_input'; for 'sequence' a valve begins to open there.
         """
-        unit = self.unit
-        opening = np.arange(0.0, 100.1, 2.5)
-        at_opening = unit.on_opening
-        area = unit.area
-        density = unit.pressure_rated_mpa**unit.exponent
+        unit, area, opening = self.unit, self.unit.area, np.arange(0.0, 100.1, 2.5)
+        at_opening, density = unit.on_opening, unit.pressure_rated_mpa**unit.exponent
         if isinstance(area, SequencedValves):
             knees = [valve.from_percent for valve in area.valves]
         else:
@@ -132,10 +113,8 @@ class ThermalLog:
                 'knees': knees,
             },
             'dynamics': {
-                'actuator_s': unit.actuator_s,
-                'high_pressure_s': unit.high_pressure_s,
-                'reheater_s': unit.reheater_s,
-                'high_pressure_share': unit.high_pressure_share,
+                name: getattr(unit, name)
+                for name in ('actuator_s', 'high_pressure_s', 'reheater_s', 'high_pressure_share')
             },
             'unit': unit.to_json(),
             'recording': dataclasses.asdict(self.historian),
@@ -144,38 +123,19 @@ class ThermalLog:
 
 
 def simulate_thermal(
-    days: float,
-    seed: int,
-    unit: ThermalUnit | None = None,
-    historian: Historian | None = None,
-    start_ns: int = DEFAULT_START_NS,
-    effects: Sequence[str | EffectSpec] = (),
-) -> ThermalLog:
-    """Simulate ``days`` of operation of a thermal unit.
+    days: float, seed: int, unit: ThermalUnit | None = None, historian: Historian | None = None,
+    start_ns: int = DEFAULT_START_NS, effects: Sequence[str | EffectSpec] = (),
+) -> ThermalLog:  # fmt: skip
+    """Simulate ``days`` of operation, at most 60, of a thermal unit; a day needs about 50 MB.
 
-    Parameters
-    ----------
-    days : float
-        Duration, more than 0 and at most 60.
-    seed : int
-        It determines every random number, for all effects and recordings.
-    unit : ThermalUnit, optional
-        By default a unit of the kind 'choked'.
-    historian : Historian, optional
-        By default every sample is stored.
-    start_ns : int
-        Time of the first sample, ns since 1970; it determines the time of day in UTC.
-    effects : sequence of str or EffectSpec
-        Effects of `thermal_catalogue` to switch on; their order has no influence.
+    The seed determines every random number, for all effects of `thermal_catalogue`, whose order
+    has no influence, and all recordings. ``start_ns`` determines the time of day in UTC. By
+    default the unit is of the kind 'choked' and every sample is stored.
 
     Raises
     ------
     InputError
         An argument is out of range, or effects cannot act in this run or not together.
-
-    Notes
-    -----
-    A day needs about 50 MB.
     """
     unit, historian = unit or ThermalUnit(), historian or Historian()
     if not 0.0 < days <= LONGEST_DAYS:
@@ -193,9 +153,8 @@ def simulate_thermal(
     install(active, hooks)
     rng = np.random.default_rng([seed, 330])
     outside = _Outside.draw(unit, hooks, rng, rows, clock_at_ns(start_ns))
-    law = law_of(unit, hooks)
     out = np.empty((len(TrueRows._fields), outside.series.demand.size))
-    run(outside.series, law, out)
+    run(outside.series, law_of(unit, hooks), out)
     truth = TrueRows(*out)
     signals = _instruments(unit, hooks, outside, truth, rng, rows)
     time_ns, columns = historian.record(start_ns, signals, rng)
@@ -206,7 +165,7 @@ def simulate_thermal(
     extra = {name: column for name, column in columns.items() if name not in mine}
     kept = slice(_WARM_UP_S, _WARM_UP_S + rows)
     return ThermalLog(
-        table, extra, unit, historian, truth.part(kept.start, kept.stop),
+        table, extra, unit, historian, TrueRows(*out[:, kept]),
         outside.series.demand[kept], outside.temperature[kept], outside.water[kept], active,
     )  # fmt: skip
 
@@ -223,13 +182,9 @@ class _Outside:
 
     @classmethod
     def draw(
-        cls,
-        unit: ThermalUnit,
-        hooks: ThermalHooks,
-        rng: np.random.Generator,
-        rows: int,
+        cls, unit: ThermalUnit, hooks: ThermalHooks, rng: np.random.Generator, rows: int,
         clock_s: float,
-    ) -> _Outside:
+    ) -> _Outside:  # fmt: skip
         """Draw all inputs, from the start of the warm-up to the margin after the end."""
         n = _WARM_UP_S + rows + _MARGIN_S
         time_s = np.arange(n, dtype=np.float64) - _WARM_UP_S
@@ -247,11 +202,7 @@ class _Outside:
         temperature = _temperature(unit, rng, demand)
         water = unit.water_degc + unit.water_weather_k * Wander(rng, 1.5 * DAY_S, 1.0).advance(n)
         water += unit.water_daily_k * np.cos(2.0 * np.pi * (clock / 3600.0 - 16.0) / 24.0)
-        forcing = LoopInputs(
-            time_s, clock, pressure_set, temperature, np.ones(n), np.ones(n), np.zeros(n)
-        )
-        for change in hooks.forcing:
-            change(forcing)
+        forcing = LoopInputs.forced(hooks, time_s, clock, pressure_set, temperature)
         gain = forcing.gain * (
             1.0 + unit.temperature_per_k * (temperature - unit.temperature_degc)
         )
@@ -275,7 +226,6 @@ class _Outside:
 def _set_point(
     unit: ThermalUnit, rng: np.random.Generator, time_s: FloatArray, clock_s: float
 ) -> FloatArray:
-    """Return schedule and AGC after the rate limit, MW (n,)."""
     low, span = unit.load_low_mw, unit.load_high_mw - unit.load_low_mw
     per_s = unit.ramp_mw_per_min / 60.0
     hour = np.mod(clock_s + time_s[0], DAY_S) / 3600.0
@@ -344,7 +294,6 @@ def _temperature(unit: ThermalUnit, rng: np.random.Generator, demand: FloatArray
 
 @kernel
 def _rate_limited(target: FloatArray, per_row: float) -> FloatArray:
-    """Follow a target by at most ``per_row`` per row."""
     out = np.empty_like(target)
     now = target[0]
     for t in range(target.size):
@@ -371,14 +320,9 @@ def _lag_rows(signal: FloatArray, a: float, b: float, c: float) -> FloatArray:
 
 
 def _instruments(
-    unit: ThermalUnit,
-    hooks: ThermalHooks,
-    outside: _Outside,
-    truth: TrueRows,
-    rng: np.random.Generator,
-    rows: int,
-) -> dict[str, FloatArray]:
-    """Return the measured values of every second, by column, float64 (rows,)."""
+    unit: ThermalUnit, hooks: ThermalHooks, outside: _Outside, truth: TrueRows,
+    rng: np.random.Generator, rows: int,
+) -> dict[str, FloatArray]:  # fmt: skip
     kept = slice(_WARM_UP_S, _WARM_UP_S + rows)
     n, noise = truth.power.size, unit.noise
     series = outside.series

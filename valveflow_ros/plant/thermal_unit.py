@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from valveflow_ros.errors import InputError
+from valveflow_ros.plant.unit import refuse_unless
 from valveflow_ros.records import FloatArray
 
 # Openings above 100 % do not occur; the table ends at the end of the area of a group.
@@ -25,24 +26,13 @@ TABLE_STEP_PERCENT = 0.05
 
 @dataclass(frozen=True, slots=True)
 class SmoothArea:
-    """The area of valves that move together: nearly straight sections with rounded joints.
+    """The area of valves that move together: nearly straight sections with rounded joints."""
 
-    Attributes
-    ----------
-    knees_percent : tuple of float
-        Openings at which the sections meet, %.
-    slopes : tuple of float
-        Slopes of the sections, one more than knees; only their ratios matter.
-    rounding_percent : float
-        Width of opening of four fifths of a knee's change of slope, %.
-    """
-
-    knees_percent: tuple[float, ...] = (50.0, 71.0)
-    slopes: tuple[float, ...] = (1.0, 0.45, 0.25)
-    rounding_percent: float = 2.0
+    knees_percent: tuple[float, ...] = (50.0, 71.0)  # openings at which the sections meet
+    slopes: tuple[float, ...] = (1.0, 0.45, 0.25)  # of the sections; only their ratios matter
+    rounding_percent: float = 2.0  # the opening of four fifths of a knee's change of slope
 
     def __post_init__(self) -> None:
-        """Check that the curve rises."""
         knees = self.knees_percent
         good = len(self.slopes) == len(knees) + 1 and min(self.slopes) > 0.0
         if not (good and list(knees) == sorted(knees) and 0.1 <= self.rounding_percent <= 10.0):
@@ -66,22 +56,12 @@ class SmoothArea:
 
 @dataclass(frozen=True, slots=True)
 class GovernorValve:
-    """One of several valves that open in sequence.
+    """One of several valves that open in sequence."""
 
-    Attributes
-    ----------
-    from_percent, to_percent : float
-        Demands at which it begins to open and at which it is fully open, %.
-    share : float
-        Fraction of the whole area; only ratios matter.
-    bend : float
-        Flattening of its area towards full lift; 0 is straight.
-    """
-
-    from_percent: float
-    to_percent: float
-    share: float
-    bend: float = 2.2
+    from_percent: float  # the demand at which it begins to open
+    to_percent: float  # and that at which it is fully open
+    share: float  # of the whole area; only ratios matter
+    bend: float = 2.2  # flattening of its area towards full lift; 0 is straight
 
     def lift_percent(self, demand_percent: FloatArray) -> FloatArray:
         """Return its own position, 0 to 100 %."""
@@ -111,7 +91,6 @@ class SequencedValves:
     )
 
     def __post_init__(self) -> None:
-        """Check that the valves suit each other."""
         good = 1 <= len(self.valves) <= 8 and all(
             v.from_percent < v.to_percent and v.share > 0.0 and v.bend >= 0.0 for v in self.valves
         )
@@ -155,98 +134,58 @@ KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class ThermalUnit:
-    """A reheat unit of about 330 MW, sampled at 1 s.
+    """A reheat unit of about 330 MW, sampled at 1 s."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`: 'choked' has the flow ``p^m f(V)``, 'sequence' the same with several
-        valves, 'integrated_input' the paper's ``g(V p^m)``; '_fixed' means fixed pressure.
-    area : SmoothArea or SequencedValves
-        f, or g over the opening at rated pressure.
-    exponent : float
-        m.
-    rated_mw, no_load_mw : float
-        Power at full flow, and c: power = (rated + c) flow - c.
-    full_opening_percent : float
-        Opening of full flow at rated pressure.
-    load_low_mw, load_high_mw : float
-        Range of the load schedule.
-    pressure_rated_mpa, pressure_low_mpa : float
-        Set point at and above ``slide_to_mw``, and at and below ``slide_from_mw``.
-    pressure_wander_mpa : float
-        Standard deviation of the set point's slow variation, in addition to that by the fire.
-    reserve_hours : float
-        Fraction of the time at which a sliding unit must have a reserve: for hours the pressure is
-        between the sliding and the rated one, so that the valve throttles.
-    storage_s, fuel_s, mill_s : float
-        Seconds of full flow that would consume the boiler's pressure; lags of the fire.
-    drop : float
-        Pressure drop between drum and valve at full flow, as a fraction of the rated pressure.
-    actuator_s, high_pressure_s, reheater_s, high_pressure_share
-        Lags in s, and the fraction of the power generated before the reheater.
-    integral_s : float
-        Reset time of the governor's integral action on MW.
-    ramp_mw_per_min, agc_mw : float
-        Maximum rate of the set point; standard deviation of the AGC's addition to the schedule.
-    droop, dead_band_hz : float
-        Primary response.
-    temperature_degc, temperature_wander_k, temperature_load_k : float
-        Steam temperature at full load, its random variation, and its decrease at lowest load.
-    temperature_per_k, vacuum_per_kpa : float
-        Relative change of the power per K and per kPa of condenser pressure; 0 is none.
-    water_degc, water_weather_k, water_daily_k : float
-        Cooling water: mean (the reference), variation by weather over days, daily amplitude.
-    swing_mw : float
-        Standard deviation of the power's own noise, with a time constant of 15 s.
-    fire : float
-        Standard deviation of the heat's noise as a fraction of full flow; time constant 900 s.
-    noise, resolution : dict
-        Standard deviation and smallest step of the instruments, by column.
-    """
-
+    # One of `KINDS`: 'choked' has the flow ``p^m f(V)``, 'sequence' the same with several valves,
+    # 'integrated_input' the paper's ``g(V p^m)``; '_fixed' means fixed pressure.
     kind: str = 'choked'
+    # f, or g over the opening at rated pressure.
     area: SmoothArea | SequencedValves = field(default_factory=SmoothArea)
-    exponent: float = 1.0
-    rated_mw: float = 330.0
-    no_load_mw: float = 14.0
-    full_opening_percent: float = 88.0
-    load_low_mw: float = 140.0
+    exponent: float = 1.0  # m
+    rated_mw: float = 330.0  # at full flow
+    no_load_mw: float = 14.0  # c of power = (rated + c) flow - c
+    full_opening_percent: float = 88.0  # of full flow at rated pressure
+    load_low_mw: float = 140.0  # range of the load schedule
     load_high_mw: float = 322.0
-    pressure_rated_mpa: float = 16.7
-    pressure_low_mpa: float = 9.6
+    pressure_rated_mpa: float = 16.7  # set point at and above ``slide_to_mw``
+    pressure_low_mpa: float = 9.6  # at and below ``slide_from_mw``
     slide_from_mw: float = 165.0
     slide_to_mw: float = 300.0
+    # Standard deviation of the set point's slow variation, in addition to that by the fire.
     pressure_wander_mpa: float = 0.25
+    # Fraction of the time at which a sliding unit must have a reserve: for hours the pressure is
+    # between the sliding and the rated one, so that the valve throttles.
     reserve_hours: float = 0.4
-    storage_s: float = 220.0
-    fuel_s: float = 80.0
+    storage_s: float = 220.0  # of full flow that would consume the boiler's pressure
+    fuel_s: float = 80.0  # lags of the fire
     mill_s: float = 25.0
+    # Of the pressure between drum and valve at full flow, as a fraction of the rated pressure.
     drop: float = 0.05
-    actuator_s: float = 1.0
+    actuator_s: float = 1.0  # lags
     high_pressure_s: float = 0.6
     reheater_s: float = 11.0
-    high_pressure_share: float = 0.3
-    integral_s: float = 45.0
-    ramp_mw_per_min: float = 6.0
-    agc_mw: float = 3.0
-    droop: float = 0.05
+    high_pressure_share: float = 0.3  # of the power, generated before the reheater
+    integral_s: float = 45.0  # reset time of the governor's integral action on MW
+    ramp_mw_per_min: float = 6.0  # maximum rate of the set point
+    agc_mw: float = 3.0  # standard deviation of the AGC's addition to the schedule
+    droop: float = 0.05  # of the primary response, with its dead band
     dead_band_hz: float = 0.033
-    temperature_degc: float = 538.0
-    temperature_wander_k: float = 1.8
-    temperature_load_k: float = 4.0
+    temperature_degc: float = 538.0  # of the steam at full load
+    temperature_wander_k: float = 1.8  # its random variation
+    temperature_load_k: float = 4.0  # its decrease at lowest load
+    # Relative change of the power per K and per kPa of condenser pressure; 0 is none.
     temperature_per_k: float = 0.0
     vacuum_per_kpa: float = -0.008
-    water_degc: float = 20.0
-    water_weather_k: float = 2.0
-    water_daily_k: float = 1.0
-    swing_mw: float = 0.25
-    fire: float = 0.007
+    water_degc: float = 20.0  # mean of the cooling water, the reference
+    water_weather_k: float = 2.0  # its variation over days
+    water_daily_k: float = 1.0  # its daily amplitude
+    swing_mw: float = 0.25  # standard deviation of the power's own noise; time constant 15 s
+    fire: float = 0.007  # that of the heat, as a fraction of full flow; time constant 900 s
+    # Standard deviation and smallest step of the instruments, by column.
     noise: dict[str, float] = field(default_factory=lambda: dict(NOISE))
     resolution: dict[str, float] = field(default_factory=lambda: dict(RESOLUTION))
 
     def __post_init__(self) -> None:
-        """Check that the unit can be simulated."""
         if self.kind not in KINDS:
             raise InputError(f"There is no unit '{self.kind}': use one of {', '.join(KINDS)}.")
         times = (self.storage_s, self.fuel_s, self.mill_s, self.actuator_s, self.high_pressure_s,
@@ -255,33 +194,21 @@ class ThermalUnit:
             (min(times) > 0.0, 'its times must be above 0 s'),
             (0.5 <= self.exponent <= 2.0, 'the exponent must be 0.5 to 2'),
             (self.no_load_mw >= 0.0, 'no_load_mw must be 0 or more'),
-            (
-                0.0 < self.load_low_mw < self.load_high_mw <= self.rated_mw,
-                'loads must be above 0, rising, and at most rated_mw',
-            ),
-            (
-                self.load_low_mw <= self.slide_from_mw < self.slide_to_mw,
-                'slide_from_mw must be load_low_mw or more and less than slide_to_mw',
-            ),
-            (
-                1.0 <= self.pressure_low_mpa <= self.pressure_rated_mpa <= 35.0,
-                'pressures must be 1 to 35 MPa and the lowest not above the rated one',
-            ),
+            (0.0 < self.load_low_mw < self.load_high_mw <= self.rated_mw,
+             'loads must be above 0, rising, and at most rated_mw'),
+            (self.load_low_mw <= self.slide_from_mw < self.slide_to_mw,
+             'slide_from_mw must be load_low_mw or more and less than slide_to_mw'),
+            (1.0 <= self.pressure_low_mpa <= self.pressure_rated_mpa <= 35.0,
+             'pressures must be 1 to 35 MPa and the lowest not above the rated one'),
             (10.0 <= self.full_opening_percent <= 100.0, 'full_opening_percent: 10 to 100 %'),
             (0.0 <= self.reserve_hours <= 1.0, 'reserve_hours must be 0 to 1'),
             (0.0 <= self.high_pressure_share <= 1.0, 'high_pressure_share must be 0 to 1'),
-            (
-                self.ramp_mw_per_min > 0.0 and self.droop > 0.0,
-                'ramp_mw_per_min and droop must be above 0',
-            ),
-            (
-                max(abs(self.temperature_per_k), abs(self.vacuum_per_kpa)) <= 0.05,
-                'temperature_per_k and vacuum_per_kpa must be -0.05 to 0.05',
-            ),
-        )
-        for good, sentence in checks:
-            if not good:
-                raise InputError(f'This unit cannot be simulated: {sentence}.')
+            (self.ramp_mw_per_min > 0.0 and self.droop > 0.0,
+             'ramp_mw_per_min and droop must be above 0'),
+            (max(abs(self.temperature_per_k), abs(self.vacuum_per_kpa)) <= 0.05,
+             'temperature_per_k and vacuum_per_kpa must be -0.05 to 0.05'),
+        )  # fmt: skip
+        refuse_unless('unit cannot be simulated', *checks)
 
     @property
     def form(self) -> str:
@@ -308,33 +235,18 @@ class ThermalUnit:
         return np.asarray(np.interp(np.asarray(opening_percent) * density, known, table))
 
     def static_power(self, opening_percent: FloatArray, pressure_mpa: FloatArray) -> FloatArray:
-        """Return the steady-state power, without effects.
+        """Return the steady-state power without effects, MW, at true openings and pressures (n,).
 
-        Parameters
-        ----------
-        opening_percent : float64 (n,)
-            True opening, % (of several valves the demand).
-        pressure_mpa : float64 (n,)
-            True pressure before the valve, MPa absolute.
-
-        Returns
-        -------
-        float64 (n,)
-            MW at the reference steam temperature (`temperature_degc`) and with cooling water
-            at its reference (`water_degc`).
+        It is that at `temperature_degc` and `water_degc`; the opening of several valves is the
+        demand.
         """
         flow = self.flow(opening_percent, pressure_mpa)
         return np.asarray((self.rated_mw + self.no_load_mw) * flow - self.no_load_mw)
 
     def pressure_set_mpa(self, load_mw: FloatArray) -> FloatArray:
         """Return the pressure set point at a load: constant, sliding, constant."""
-        return np.asarray(
-            np.interp(
-                load_mw,
-                (self.slide_from_mw, self.slide_to_mw),
-                (self.pressure_low_mpa, self.pressure_rated_mpa),
-            )
-        )
+        ends = (self.pressure_low_mpa, self.pressure_rated_mpa)
+        return np.asarray(np.interp(load_mw, (self.slide_from_mw, self.slide_to_mw), ends))
 
     def to_json(self) -> dict[str, Any]:
         """Return all constants of the unit."""
@@ -368,10 +280,8 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
     rated, c = rng.uniform(320.0, 335.0), rng.uniform(8.0, 22.0)
     exponent, top = rng.uniform(1.0, 1.13), rng.uniform(16.2, 17.2)
     low, full = rng.uniform(132.0, 155.0), rng.uniform(84.0, 90.0)
-    slide_from, slide_to = (
-        max(low, rng.uniform(0.42, 0.54) * rated),
-        rng.uniform(0.86, 0.94) * rated,
-    )
+    slide_from = max(low, rng.uniform(0.42, 0.54) * rated)
+    slide_to = rng.uniform(0.86, 0.94) * rated
     lowest = top
     if sliding:
         # Fraction of the full area that is open at the lower end of the sliding range.

@@ -17,31 +17,22 @@ from valveflow_ros.errors import InputError
 from valveflow_ros.records import FloatArray
 
 
-def _refuse_unless(what: str, *checks: tuple[bool | np.bool_, str]) -> None:
-    """Raise an error with the message of the first check that failed."""
+def refuse_unless(what: str, *checks: tuple[bool | np.bool_, str]) -> None:
+    """Raise an `InputError` with the message of the first check that failed."""
     for good, sentence in checks:
         if not good:
-            raise InputError(f'This {what} cannot be simulated: {sentence}.')
+            raise InputError(f'This {what}: {sentence}.')
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A piecewise-linear flow characteristic x = F(u), eq. (2).
+    """A piecewise-linear flow characteristic x = F(u), eq. (2)."""
 
-    Attributes
-    ----------
-    knots : float64 (J + 1,)
-        Boundaries of the pieces, % MPa^(9/8), increasing.
-    slopes, intercepts : float64 (J,)
-        MW per unit of u, and MW.
-    """
-
-    knots: FloatArray
-    slopes: FloatArray
-    intercepts: FloatArray
+    knots: FloatArray  # (J + 1,) increasing boundaries of the pieces, % MPa^(9/8)
+    slopes: FloatArray  # (J,) MW per unit of u
+    intercepts: FloatArray  # (J,) MW
 
     def __post_init__(self) -> None:
-        """Check that the curve rises."""
         if len(self.knots) != len(self.slopes) + 1 or len(self.slopes) != len(self.intercepts):
             raise InputError(
                 'A curve of J pieces needs J + 1 ends of pieces, J slopes and J intercepts.'
@@ -76,7 +67,6 @@ class Region:
     delay_s: float
 
     def __post_init__(self) -> None:
-        """Check that the values form a first-order lag with delay."""
         if not (0.0 < self.time_constant_s < np.inf and 0.0 <= self.delay_s < np.inf):
             raise InputError(
                 f'A region needs a time constant above 0 s and a delay of 0 s or more, '
@@ -105,18 +95,11 @@ class Noise:
     load_dependence: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check that sizes are not negative and times are positive."""
         times = (self.slow_time_s, self.wander_time_s)
-        sizes = (
-            self.slow_mw,
-            self.white_mw,
-            self.opening_percent,
-            self.pressure_mpa,
-            self.temperature_k,
-            self.wander_mw,
-        )
-        _refuse_unless(
-            'noise',
+        sizes = (self.slow_mw, self.white_mw, self.opening_percent, self.pressure_mpa,
+                 self.temperature_k, self.wander_mw)  # fmt: skip
+        refuse_unless(
+            'noise cannot be simulated',
             (min(times) > 0.0, 'its times must be above 0 s'),
             (all(size >= 0.0 for size in sizes), 'its standard deviations must be 0 or more'),
             (np.isfinite(self.load_dependence), 'load_dependence must be a number'),
@@ -160,46 +143,29 @@ class Programme:
     feedback_off_above_mw: float = 289.0
 
     def __post_init__(self) -> None:
-        """Check that the values do not contradict each other."""
         low, high = self.load_low_mw, self.load_high_mw
-        times = (
-            self.pressure_lag_s,
-            self.pressure_wander_s,
-            self.temperature_wander_s,
-            self.jitter_s,
-            self.pulse_every_s,
-            self.feedback_s,
-        )
+        times = (self.pressure_lag_s, self.pressure_wander_s, self.temperature_wander_s,
+                 self.jitter_s, self.pulse_every_s, self.feedback_s)  # fmt: skip
         pressures = (self.pressure_low_mpa, self.pressure_low_mpa + self.pressure_rise_mpa)
-        _refuse_unless(
-            'programme',
+        refuse_unless(
+            'programme cannot be simulated',
             (low < self.load_mean_mw < high, 'load_mean_mw must lie between lowest and highest'),
             (low <= self.full_load_from_mw <= high, 'full_load_from_mw must lie between them'),
             (0.0 <= self.full_load_share <= 1.0, 'full_load_share must be 0 to 1'),
             (self.load_spread_mw >= 0.0, 'load_spread_mw must be 0 or more'),
             (min(self.hold_min_s, self.hold_mean_extra_s) >= 0.0, 'holds must be 0 s or more'),
-            (
-                0.0 < self.ramp_low_mw_per_min <= self.ramp_high_mw_per_min,
-                'ramps must be above 0 and the slowest not faster than the fastest',
-            ),
-            (
-                min(pressures) > 0.0 and self.pressure_span_mw > 0.0,
-                'pressures and pressure_span_mw must be above 0',
-            ),
+            (0.0 < self.ramp_low_mw_per_min <= self.ramp_high_mw_per_min,
+             'ramps must be above 0 and the slowest not faster than the fastest'),
+            (min(pressures) > 0.0 and self.pressure_span_mw > 0.0,
+             'pressures and pressure_span_mw must be above 0'),
             (min(times) > 0.0, 'its times must be above 0 s'),
-            (
-                abs(self.temperature_pressure_correlation) <= 1.0,
-                'temperature_pressure_correlation must be -1 to 1',
-            ),
-            (
-                0.0 <= self.pulse_low_percent <= self.pulse_high_percent,
-                'pulses must be 0 or more and the lowest not above the highest',
-            ),
-            (
-                self.feedback_slope_mw > 0.0 and self.feedback_limit_u >= 0.0,
-                'feedback_slope_mw must be above 0, feedback_limit_u 0 or more',
-            ),
-        )
+            (abs(self.temperature_pressure_correlation) <= 1.0,
+             'temperature_pressure_correlation must be -1 to 1'),
+            (0.0 <= self.pulse_low_percent <= self.pulse_high_percent,
+             'pulses must be 0 or more and the lowest not above the highest'),
+            (self.feedback_slope_mw > 0.0 and self.feedback_limit_u >= 0.0,
+             'feedback_slope_mw must be above 0, feedback_limit_u 0 or more'),
+        )  # fmt: skip
 
     def sliding_pressure_mpa(self, load_mw: FloatArray) -> FloatArray:
         """Return the pressure set point at a load, in MPa."""
@@ -233,7 +199,6 @@ class UnitDescription:
     sample_period_s: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check that the unit can be simulated."""
         if not 0.01 <= self.sample_period_s <= 60.0:
             raise InputError(
                 f'The sample period must lie between 0.01 and 60 s, not {self.sample_period_s}.'
@@ -269,13 +234,10 @@ def random_unit(rng: np.random.Generator) -> UnitDescription:
     curve = _curve(rng, rated, u_low, u_full)
     low, near_full, full = curve(u_low + np.array([0.0, 0.7, 1.0]) * (u_full - u_low))
     return UnitDescription(
-        curve,
-        _regions(rng, low, full),
-        _noise(rng, rated),
+        curve, _regions(rng, low, full), _noise(rng, rated),
         _programme(rng, (low, near_full, full), (pressure_low, pressure_high), u_full - u_low),
-        _EXPONENT,
-        float(rng.choice([1.0, 2.0])),
-    )
+        _EXPONENT, float(rng.choice([1.0, 2.0])),
+    )  # fmt: skip
 
 
 def _curve(rng: np.random.Generator, rated: float, u_low: float, u_full: float) -> Curve:
@@ -292,14 +254,9 @@ def _curve(rng: np.random.Generator, rated: float, u_low: float, u_full: float) 
     knots = u_low + inner * (u_full - u_low)
     low, full = rated * rng.uniform(0.45, 0.55), rated * rng.uniform(0.95, 1.0)
     powers = low + rise / rise[-1] * (full - low)
-    return _reaching_further(Curve.through(knots, powers), 0.1 * (u_full - u_low))
-
-
-def _reaching_further(curve: Curve, margin: float) -> Curve:
-    """Move the outermost knots outwards on their pieces, because noise moves u beyond them."""
-    knots: FloatArray = curve.knots.copy()
-    knots[0] -= margin
-    knots[-1] += margin
+    curve, margin = Curve.through(knots, powers), 0.1 * (u_full - u_low)
+    # The outermost knots lie further out on their pieces, because noise moves u beyond them.
+    knots[[0, -1]] += (-margin, margin)
     return Curve(knots, curve.slopes, curve.intercepts)
 
 
@@ -319,13 +276,10 @@ def _noise(rng: np.random.Generator, rated: float) -> Noise:
     """Draw disturbances of 0.5 to 1.5 times those of the paper's unit."""
     scale = rated / _PAPER_RATED_MW
     return Noise(
-        slow_mw=2.0 * scale * rng.uniform(0.5, 1.5),
-        slow_time_s=rng.uniform(30.0, 120.0),
-        white_mw=2.2 * scale * rng.uniform(0.5, 1.5),
-        opening_percent=rng.uniform(0.01, 0.03),
-        pressure_mpa=rng.uniform(0.005, 0.015),
-        temperature_k=rng.uniform(0.1, 0.3),
-    )
+        slow_mw=2.0 * scale * rng.uniform(0.5, 1.5), slow_time_s=rng.uniform(30.0, 120.0),
+        white_mw=2.2 * scale * rng.uniform(0.5, 1.5), opening_percent=rng.uniform(0.01, 0.03),
+        pressure_mpa=rng.uniform(0.005, 0.015), temperature_k=rng.uniform(0.1, 0.3),
+    )  # fmt: skip
 
 
 def _programme(
@@ -338,23 +292,13 @@ def _programme(
     low, near_full, full = loads_mw
     scale = (full - low) / _PAPER_LOAD_SPAN_MW
     return Programme(
-        load_mean_mw=low + 68.0 * scale,
-        load_daily_mw=32.0 * scale,
-        load_spread_mw=50.0 * scale,
-        load_low_mw=low,
-        load_high_mw=full,
-        full_load_from_mw=near_full,
-        ramp_low_mw_per_min=2.5 * scale,
-        ramp_high_mw_per_min=6.0 * scale,
-        pressure_low_mpa=pressures_mpa[0],
-        pressure_rise_mpa=pressures_mpa[1] - pressures_mpa[0],
-        pressure_span_mw=full - low,
-        pressure_wander_mpa=rng.uniform(0.15, 0.3),
-        temperature_degc=rng.uniform(535.0, 542.0),
-        jitter_percent=rng.uniform(0.2, 0.4),
-        pulse_every_s=rng.uniform(1000.0, 2000.0),
-        feedback=bool(rng.random() < 0.8),
-        feedback_slope_mw=(full - low) / u_span,
-        feedback_limit_u=150.0 * u_span / _PAPER_U_SPAN,
+        load_mean_mw=low + 68.0 * scale, load_daily_mw=32.0 * scale, load_spread_mw=50.0 * scale,
+        load_low_mw=low, load_high_mw=full, full_load_from_mw=near_full,
+        ramp_low_mw_per_min=2.5 * scale, ramp_high_mw_per_min=6.0 * scale,
+        pressure_low_mpa=pressures_mpa[0], pressure_rise_mpa=pressures_mpa[1] - pressures_mpa[0],
+        pressure_span_mw=full - low, pressure_wander_mpa=rng.uniform(0.15, 0.3),
+        temperature_degc=rng.uniform(535.0, 542.0), jitter_percent=rng.uniform(0.2, 0.4),
+        pulse_every_s=rng.uniform(1000.0, 2000.0), feedback=bool(rng.random() < 0.8),
+        feedback_slope_mw=(full - low) / u_span, feedback_limit_u=150.0 * u_span / _PAPER_U_SPAN,
         feedback_off_above_mw=full - 4.5 * scale,
-    )
+    )  # fmt: skip

@@ -9,38 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.curve.characteristic import (
-    Characteristic,
-    Choice,
-    RegionDynamics,
-    piece_of,
-)
+from valveflow_ros.curve.characteristic import Characteristic, Choice, RegionDynamics, piece_of
 from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.fit.result import forms_apart, is_borrowed, wrong_form
 from valveflow_ros.records import FloatArray, Signal
-from valveflow_ros.report.figure import Figure, Spec, axis, line, rounded, token
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
+from valveflow_ros.report.figure import Figure, Spec
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.page import notice, paragraph, table, text
-from valveflow_ros.report.words import (
-    NOT_KNOWN,
-    Z95,
-    count,
-    counted,
-    decimals,
-    duration,
-    held_words,
-    input_name,
-    input_unit,
-    interval,
-    is_known,
-    level,
-    per_input,
-    percent,
-    plain,
-    span,
-    time_with_error,
-    with_error,
-)
+from valveflow_ros.report.words import NOT_KNOWN, Z95
 from valveflow_ros.signals.static_form import OPENING
 
 # Below this explained fraction of the power, it depends on something else, or a signal is wrong.
@@ -66,8 +44,9 @@ def doubt(data: Identified) -> str:
     share, misfit = explained(data), data.misfit
     if share < _LITTLE:
         return (
-            f'Do not rely on this curve: it explains only {percent(share)} of the variance of the '
-            'power. Look whether a signal is constant, taken for another one, or in another unit.'
+            f'Do not rely on this curve: it explains only {say.percent(share)} of the variance of '
+            'the power. Look whether a signal is constant, taken for another one, or in another '
+            'unit.'
         )
     told = [words] if (words := _no_effect(data)) else []
     if misfit is not None:
@@ -81,7 +60,6 @@ def doubt(data: Identified) -> str:
 
 
 def _no_effect(data: Identified) -> str:
-    """Return a warning if the power follows the pressure and hardly the opening; else empty."""
     gains = gain_by_load(data)
     if not gains:
         return ''
@@ -92,8 +70,8 @@ def _no_effect(data: Identified) -> str:
         return ''
     return (
         'Do not rely on this curve: the power follows the pressure alone, and the whole range of '
-        f'the opening makes at most {plain(max(effect, 0.1), 2)} MW. Is this the pressure before '
-        'the valve, or one behind it?'
+        f'the opening makes at most {say.plain(max(effect, 0.1), 2)} MW. Is this the pressure '
+        'before the valve, or one behind it?'
     )
 
 
@@ -101,9 +79,9 @@ def misfit_words(misfit: Misfit) -> str:
     """Return the size of a systematic error of the curve and where it is largest, in words."""
     opening, pressure, most = misfit.worst
     return (
-        f'{plain(misfit.rms_mw, 2)} MW (root mean square) at the openings and pressures of these '
-        f'data, most at {decimals(opening, 0)} % and {decimals(pressure, 1)} MPa, where the '
-        f'measured power differs by {plain(most, 2)} MW'
+        f'{say.plain(misfit.rms_mw, 2)} MW (root mean square) at the openings and pressures of '
+        f'these data, most at {say.decimals(opening, 0)} % and {say.decimals(pressure, 1)} MPa, '
+        f'where the measured power differs by {say.plain(most, 2)} MW'
     )
 
 
@@ -123,8 +101,8 @@ def form_words(c: Characteristic) -> str:
         return ''
     return (
         f'The breakpoints of this valve are at fixed openings: the power follows {mine}. On '
-        'held-out data the error of this form is '
-        f'{plain(form.rmse_mw, 2)} MW, that of {form.other} {plain(form.rmse_other_mw, 2)} MW.'
+        f'held-out data the error of this form is {say.plain(form.rmse_mw, 2)} MW, that of '
+        f'{form.other} {say.plain(form.rmse_other_mw, 2)} MW.'
     )
 
 
@@ -134,31 +112,22 @@ _LEAST_ROWS = 20
 
 
 class LoadGain(NamedTuple):
-    """The effect of the opening at a load.
+    """The effect of the opening at a load."""
 
-    ``load`` in MW, median ``pressure`` in MPa and ``opening`` in % of the rows near it, ``gain``
-    there in MW per % of opening with its 95 % ``error``, and its ``low`` and ``high`` over nine
-    of ten of these rows, whose pressures and openings differ.
-    """
-
-    load: float
-    pressure: float
-    opening: float
-    gain: float
-    error: float
-    low: float
+    load: float  # MW
+    pressure: float  # median of the rows near it, MPa
+    opening: float  # %
+    gain: float  # there, MW per % of opening
+    error: float  # its 95 % error
+    low: float  # its range over nine of ten of these rows, whose pressures and openings differ
     high: float
 
 
 def gain_by_load(data: Identified) -> list[LoadGain]:
     """Return the effect of the opening at each load, from all rows."""
     c = data.characteristic
-    rows = np.column_stack([
-        data.table.column(signal)
-        for signal in (
-            Signal.GENERATED_POWER, Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE
-        )
-    ])  # fmt: skip
+    wanted = [Signal.GENERATED_POWER, Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]
+    rows = data.table.values[:, wanted]
     power, opening, pressure = rows[np.isfinite(rows).all(axis=1)].T
     if not len(power):
         return []
@@ -191,11 +160,11 @@ def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
             f'{unit} per 1 % of opening', '95 % interval', 'range at this load']  # fmt: skip
     cells = [
         [
-            decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1), decimals(g.pressure, 1),
-            decimals(g.opening, 0), plain(g.gain, 3),
-            f'{plain(g.gain - g.error, 3)} to {plain(g.gain + g.error, 3)}'
+            say.decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1), say.decimals(g.pressure, 1),
+            say.decimals(g.opening, 0), say.plain(g.gain, 3),
+            f'{say.plain(g.gain - g.error, 3)} to {say.plain(g.gain + g.error, 3)}'
             if g.error > 0.0 else '-',
-            f'{plain(g.low, 3)} to {plain(g.high, 3)}',
+            f'{say.plain(g.low, 3)} to {say.plain(g.high, 3)}',
         ]
         for g in gain_by_load(data)
     ]  # fmt: skip
@@ -209,7 +178,7 @@ def gain_table(data: Identified) -> str:
         'MW per 1 % of opening at each load, at the pressure that is usual at this load. The '
         'range is that of nine tenths of the time at this load, with other pressures and openings.'
     )
-    return table(head, cells, caption=caption) if cells else ''
+    return html.table(head, cells, caption=caption) if cells else ''
 
 
 def answer_words(data: Identified) -> str:
@@ -217,38 +186,36 @@ def answer_words(data: Identified) -> str:
     c = data.shown
     ends, values, m = c.breakpoints, c.values(), c.pressure_exponent
     words = (
-        f'The flow characteristic has <b>{counted(len(c.pieces), "piece")}</b> and is known from '
-        f'{span(values[0], values[-1])} MW{data.at_pressure} ({input_name(m)} from '
-        f'{span(ends[0], ends[-1])} {input_unit(m)}).{_bends(c)} It explains '
-        f'{percent(explained(data))} of the variance of the power in '
-        f'{counted(c.source.steady, "steady-state segment")} and '
-        f'{counted(c.source.slope_response, "slope-response segment")} '
-        f'({counted(c.source.samples, "sample")}). The typical difference between curve and '
-        'samples is '
-        f'{plain(c.residuals.rmse_mw, 2)} MW. {pieces_doubt(c)}'
+        f'The flow characteristic has <b>{say.counted(len(c.pieces), "piece")}</b> and is known '
+        f'from {say.span(values[0], values[-1])} MW{data.at_pressure} ({say.input_name(m)} from '
+        f'{say.span(ends[0], ends[-1])} {say.input_unit(m)}).{_bends(c)} It explains '
+        f'{say.percent(explained(data))} of the variance of the power in '
+        f'{say.counted(c.source.steady, "steady-state segment")} and '
+        f'{say.counted(c.source.slope_response, "slope-response segment")} '
+        f'({say.counted(c.source.samples, "sample")}). The typical difference between curve and '
+        f'samples is {say.plain(c.residuals.rmse_mw, 2)} MW. {pieces_doubt(c)}'
     )
-    told = [text(doubt(data))]
+    told = [html.text(doubt(data))]
     if c.source.temperature_flag:
-        limit = plain(data.settings.real('temperature_spread_limit'))
+        limit = say.plain(data.settings.real('temperature_spread_limit'))
         told.append(
-            f'The main steam temperature spread over {plain(c.source.temperature_spread_k, 3)} K '
-            f'in the special segments (limit {limit} K). The method assumes a constant one: part '
-            'of what the curve shows may come from the temperature.'
+            'The main steam temperature spread over '
+            f'{say.plain(c.source.temperature_spread_k, 3)} K in the special segments (limit '
+            f'{limit} K). The method assumes a constant one: part of what the curve shows may '
+            'come from the temperature.'
         )
     if any(p.slope <= 0.0 for p in c.pieces):
         told.append(
-            'On one piece the power does not rise with u, so the curve has no inverse there '
-            'and cannot be '
-            'compensated. A flat upper end is normal; a falling piece elsewhere is not.'
+            'On one piece the power does not rise with u, so the curve has no inverse there and '
+            'cannot be compensated. A flat upper end is normal; a falling piece elsewhere is not.'
         )
-    told += [text(n) for n in (held_words(c.held), *c.notes)]
+    told += [html.text(n) for n in (say.held_words(c.held), *c.notes)]
     form = form_words(data.characteristic)
-    said = paragraph(words, 'answer') + (paragraph(text(form)) if form else '')
-    return said + ''.join(notice(n) for n in told if n)
+    said = html.paragraph(words, 'answer') + (html.paragraph(html.text(form)) if form else '')
+    return said + ''.join(html.notice(n) for n in told if n)
 
 
 def _bends(c: Characteristic) -> str:
-    """Return what the shape of the curve means for control."""
     if len(c.pieces) == 1:
         return ' It is straight.'
     steep = max(c.pieces, key=lambda p: p.slope)
@@ -258,39 +225,39 @@ def _bends(c: Characteristic) -> str:
     if flat.slope <= 0.0:
         return f'{said}; at {there} opening further <b>does not raise the power</b>.'
     weak = ': there the valve hardly changes the power' if flat.slope < _FLAT * steep.slope else ''
-    times = plain(steep.slope / flat.slope, 2)
+    times = say.plain(steep.slope / flat.slope, 2)
     return f'{said}, and {times} times less at {there}{weak}.'
 
 
 def pieces_table(data: Identified) -> str:
     """Return a table with one row per piece."""
     c = data.shown
-    m, u = c.pressure_exponent, input_name(c.pressure_exponent)
+    m, u = c.pressure_exponent, say.input_name(c.pressure_exponent)
     rows = []
     for k, piece in enumerate(c.pieces):
         low, high = (piece.slope * u + piece.intercept for u in (piece.u_from, piece.u_to))
         rows.append([
-            str(k + 1), span(piece.u_from, piece.u_to, 1), span(low, high, 1),
-            with_error(piece.slope, piece.slope_stderr),
-            with_error(piece.intercept, piece.intercept_stderr), count(piece.samples),
+            str(k + 1), say.span(piece.u_from, piece.u_to, 1), say.span(low, high, 1),
+            say.with_error(piece.slope, piece.slope_stderr),
+            say.with_error(piece.intercept, piece.intercept_stderr), say.count(piece.samples),
             *_rests(c, k),
         ])  # fmt: skip
     head = [
-        'piece', f'{u} ({input_unit(m)})', f'power{data.at_pressure} (MW)',
-        f'slope, 95 % ({per_input(m)})', 'intercept, 95 % (MW)',
+        'piece', f'{u} ({say.input_unit(m)})', f'power{data.at_pressure} (MW)',
+        f'slope, 95 % ({say.per_input(m)})', 'intercept, 95 % (MW)',
         'samples', *(['rests on'] if c.support else []),
     ]  # fmt: skip
-    return table(head, rows)
+    return html.table(head, rows)
 
 
 def _rests(c: Characteristic, k: int) -> list[str]:
-    """Return the data behind a piece, as a cell of the table; empty list if unknown."""
     if not c.support:
         return []
     found = c.support[k]
     said = (
-        f'{counted(found.steady, "steady state")} at {counted(len(found.levels), "level")}, '
-        f'{counted(found.slope_response, "slope response")}'
+        f'{say.counted(found.steady, "steady state")} at '
+        f'{say.counted(len(found.levels), "level")}, '
+        f'{say.counted(found.slope_response, "slope response")}'
     )
     if found.identifiable:
         return [said]
@@ -306,14 +273,14 @@ def breakpoints_table(c: Characteristic) -> str:
     if len(c.pieces) < 2:
         return ''
     rows = [
-        [str(k), level(piece.u_to, 1), interval(low, high), level(float(value), 1)]
+        [str(k), say.level(piece.u_to, 1), say.interval(low, high), say.level(float(value), 1)]
         for k, (piece, (low, high), value) in enumerate(
             zip(c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True), 1
         )
     ]
-    unit = input_unit(c.pressure_exponent)
-    u = input_name(c.pressure_exponent)
-    return table(['break&shy;point', f'{u} ({unit})', '95 % interval', 'power (MW)'], rows)
+    unit = say.input_unit(c.pressure_exponent)
+    u = say.input_name(c.pressure_exponent)
+    return html.table(['break&shy;point', f'{u} ({unit})', '95 % interval', 'power (MW)'], rows)
 
 
 def temperature_words(c: Characteristic) -> str:
@@ -321,19 +288,19 @@ def temperature_words(c: Characteristic) -> str:
     source = c.source
     if not math.isfinite(source.temperature_spread_k):
         return 'The main steam temperature is not known.'
-    mean = f'{decimals(source.temperature_mean_degc, 1)} °C'
+    mean = f'{say.decimals(source.temperature_mean_degc, 1)} °C'
     if source.temperature_spread_k == 0.0:
         return f'Main steam temperature: {mean} throughout.'
     verdict = 'more than the method allows for' if source.temperature_flag else 'within its limit'
     return (
         f'Main steam temperature in the special segments: mean {mean}, 95 % of it within '
-        f'{plain(source.temperature_spread_k, 3)} K, {verdict}.'
+        f'{say.plain(source.temperature_spread_k, 3)} K, {verdict}.'
     )
 
 
 def window_words(c: Characteristic) -> str:
     """Return the length of the window."""
-    return duration((c.source.window_end_ns - c.source.window_start_ns) / 1e9)
+    return say.duration((c.source.window_end_ns - c.source.window_start_ns) / 1e9)
 
 
 _LOOKS = (('chosen', 'solid'), ('steady', 'dash'), ('slope', 'dot'))
@@ -343,24 +310,20 @@ def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
     """Return time constant and delay by region of power; 'not known' if below its error."""
     rows = [
         [
-            f'{span(d.power_from, d.power_to)} MW',
-            time_with_error(d.time_constant_s, d.time_constant_stderr_s),
-            time_with_error(d.delay_s, d.delay_stderr_s),
-            decimals(d.delay_s + 3.0 * d.time_constant_s, 0) if _told(d) else NOT_KNOWN,
+            f'{say.span(d.power_from, d.power_to)} MW',
+            say.time_with_error(d.time_constant_s, d.time_constant_stderr_s),
+            say.time_with_error(d.delay_s, d.delay_stderr_s),
+            say.decimals(d.delay_s + 3.0 * d.time_constant_s, 0) if _told(d) else NOT_KNOWN,
         ]
         for d in dynamics
     ]
-    head = [
-        'power',
-        'time constant T, 95 % (s)',
-        'delay τ, 95 % (s)',
-        '95 % done after τ + 3 T (s)',
-    ]
-    return table(head, rows)
+    head = ['power', 'time constant T, 95 % (s)', 'delay τ, 95 % (s)',
+            '95 % done after τ + 3 T (s)']  # fmt: skip
+    return html.table(head, rows)
 
 
 def _told(region: RegionDynamics) -> bool:
-    return is_known(region.time_constant_s, region.time_constant_stderr_s)
+    return say.is_known(region.time_constant_s, region.time_constant_stderr_s)
 
 
 def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
@@ -378,12 +341,13 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
     for k, d in enumerate(dynamics):
         colour, dash = _LOOKS[k % 3]
         moved = 100.0 * (1.0 - np.exp(-np.maximum(t - d.delay_s, 0.0) / d.time_constant_s))
-        traces.append(line(
-            rounded(t), rounded(moved, 4), f'{span(d.power_from, d.power_to)} MW', colour,
-            '%{x:.0f} s: %{y:.0f} %', width=2.2, dash=dash,
+        traces.append(plot.line(
+            plot.rounded(t), plot.rounded(moved, 4), f'{say.span(d.power_from, d.power_to)} MW',
+            colour, '%{x:.0f} s: %{y:.0f} %', width=2.2, dash=dash,
         ))  # fmt: skip
     title = {'text': 'seconds after a step of the steam flow', 'short': 'seconds after a step'}
-    layout = {'xaxis': axis(title), 'yaxis': axis('power has moved (%)'), 'showlegend': True}
+    layout = {'xaxis': plot.axis(title), 'yaxis': plot.axis('power has moved (%)'),
+              'showlegend': True}  # fmt: skip
     caption = (
         '<b>The further right a line rises, the slower the unit answers there.</b> '
         'Each line is the identified first-order answer of one range of power.'
@@ -395,7 +359,7 @@ def dynamics_figure(dynamics: tuple[RegionDynamics, ...]) -> Figure | None:
 
 _KEPT = {
     'prediction_error': 'the number kept is the one that predicts all samples best once the '
-    'dynamics are known',
+    'dynamics are known'
 }
 _LEAST_SHOWN = 0.005  # smaller probabilities of a number of pieces are not listed
 _DOUBTFUL = 0.05  # probability of another number of pieces that makes the chosen one uncertain
@@ -411,13 +375,13 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
     """Return Omega(J) on a log axis above Lambda(J), with the confidence if there is one."""
 
     def colours(numbers: list[int]) -> list[str]:
-        return [token('chosen' if k == chosen else 'data') for k in numbers]
+        return [plot.token('chosen' if k == chosen else 'data') for k in numbers]
 
     def values_of(values: dict[int, float], up: str, name: str, hover: str) -> Spec:
         j = sorted(values)
         sizes = [13 if k == chosen else 7 for k in j]
-        return line(
-            j, rounded([values[k] for k in j], 8), name, 'data', f'J = %{{x}}<br>{hover}',
+        return plot.line(
+            j, plot.rounded([values[k] for k in j], 8), name, 'data', f'J = %{{x}}<br>{hover}',
             width=1.5, mode='lines+markers', yaxis=up, showlegend=False,
             marker={'size': sizes, 'color': colours(j)},
         )  # fmt: skip
@@ -429,10 +393,10 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
     sure = bool(choice.confidence)
     first, second = ([0.7, 1.0], [0.34, 0.64]) if sure else ([0.56, 1.0], [0.0, 0.44])
     layout = {
-        'xaxis': axis('number of pieces J', dtick=1, anchor='y3' if sure else 'y2'),
-        'yaxis': axis('cost Ω(J)<br>(MW²)', domain=first, type='log',
-                      **_ticks(np.array(list(choice.cost.values())))),
-        'yaxis2': axis('turning<br>angle Λ(J)', domain=second, rangemode='tozero'),
+        'xaxis': plot.axis('number of pieces J', dtick=1, anchor='y3' if sure else 'y2'),
+        'yaxis': plot.axis('cost Ω(J)<br>(MW²)', domain=first, type='log',
+                           **_ticks(np.array(list(choice.cost.values())))),
+        'yaxis2': plot.axis('turning<br>angle Λ(J)', domain=second, rangemode='tozero'),
         'hovermode': 'closest',
     }  # fmt: skip
     if sure:
@@ -442,8 +406,8 @@ def choice_figure(choice: Choice, chosen: int) -> Figure:
             'y': [100.0 * choice.confidence[k] for k in j], 'marker': {'color': colours(j)},
             'hovertemplate': 'J = %{x}<br>%{y:.1f} %<extra></extra>',
         })  # fmt: skip
-        layout['yaxis3'] = axis('confidence<br>(%)', domain=[0.0, 0.28], rangemode='tozero')
-    costs = ', '.join(f'{j}: {plain(v, 3)}' for j, v in sorted(choice.cost.items()))
+        layout['yaxis3'] = plot.axis('confidence<br>(%)', domain=[0.0, 0.28], rangemode='tozero')
+    costs = ', '.join(f'{j}: {say.plain(v, 3)}' for j, v in sorted(choice.cost.items()))
     return Figure(
         'choice', _choice_caption(choice, chosen),
         f'Cost by number of pieces ({costs}); chosen is {chosen}.', traces, layout,
@@ -466,7 +430,7 @@ def _choice_caption(choice: Choice, chosen: int) -> str:
     if choice.confidence:
         words += ' At the bottom, how probable each J is.'
     if choice.note:
-        words += f' {text(choice.note).removesuffix(".")}.'
+        words += f' {html.text(choice.note).removesuffix(".")}.'
     return words
 
 
@@ -501,12 +465,12 @@ def confidence_table(choice: Choice) -> str:
     if not likely:
         return ''
     rest = sum(p for p in choice.confidence.values() if p < _LEAST_SHOWN)
-    words = paragraph(
+    words = html.paragraph(
         'How probable each number of pieces is, given these data and their noise; all others '
         f'together {_percent(rest)}.'
     )
     rows = [[str(j), _percent(p)] for j, p in likely.items()]
-    return words + table(['number of pieces J', 'probability'], rows)
+    return words + html.table(['number of pieces J', 'probability'], rows)
 
 
 def pieces_doubt(c: Characteristic) -> str:

@@ -22,6 +22,9 @@ from valveflow_ros.baselines.comparison import (
 from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.baselines.sparse import NAMES
 from valveflow_ros.records import NS_PER_S, FloatArray, SegmentKind
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import choice_figure, dynamics_table
 from valveflow_ros.report.comparison_tables import (
     LABELS,
@@ -34,28 +37,8 @@ from valveflow_ros.report.comparison_tables import (
     segments_table,
     totals_table,
 )
-from valveflow_ros.report.figure import (
-    Figure,
-    Spec,
-    axis,
-    line,
-    points,
-    rounded,
-    stripe,
-    time_axis,
-)
-from valveflow_ros.report.page import (
-    Page,
-    Section,
-    bullets,
-    folded,
-    foot,
-    paragraph,
-    table,
-    text,
-    where,
-)
-from valveflow_ros.report.words import counted, duration, input_axis, p_value, period, plain
+from valveflow_ros.report.figure import Figure, Spec
+from valveflow_ros.report.page import Page, Section
 from valveflow_ros.segments.window import WindowContents
 
 # The result of a comparison, in sentences.
@@ -103,15 +86,17 @@ def finding_words(data: Compared) -> list[str]:
     told = [_headline(r.pairs)] if r.pairs else []
     for terms, words in _TERMS.items():
         if met := _of(terms, r.pairs):
-            told.append(f'{words} valveflow has {plain(met[0].mse_ours_mw2)} MW²; {_against(met)}')
+            told.append(
+                f'{words} valveflow has {say.plain(met[0].mse_ours_mw2)} MW²; {_against(met)}'
+            )
     met = _of(Terms.AS_PAPER, r.pairs)
     steady, slope = (len(j.kinds(kind)) for kind in (SegmentKind.STEADY, SegmentKind.SLOPE))
     told.append(
         "The paper finds that a curve from special segments predicts other days' special segments "
         f'better than the simulations of a Hammerstein and of a sparse model. '
-        f'{_FINDING[finding_of(r.pairs)]} Over {counted(steady, "steady-state segment")} and '
-        f'{counted(slope, "slope-response segment")} the mean squared error of the static curve '
-        f'is {plain(met[0].mse_ours_mw2)} MW²; {_against(met)}'
+        f'{_FINDING[finding_of(r.pairs)]} Over {say.counted(steady, "steady-state segment")} and '
+        f'{say.counted(slope, "slope-response segment")} the mean squared error of the static '
+        f'curve is {say.plain(met[0].mse_ours_mw2)} MW²; {_against(met)}'
     )
     if r.failure:
         told.append(r.failure + ' So it is missing here.')
@@ -124,7 +109,7 @@ def finding_words(data: Compared) -> list[str]:
         f'The paired t test of the paper, which counts each sample, lets a mean difference of '
         f'zero stand in {stands} of {tested} segments for valveflow '
         f'({"simulated" if name.endswith("dynamic") else "curve"}). But the noise is correlated: '
-        f'one independent value takes {duration(j.widening * r.trial.step_s)}. Counted so, it '
+        f'one independent value takes {say.duration(j.widening * r.trial.step_s)}. Counted so, it '
         f'stands in {worth} of {of_worth}.'
     )
     return told
@@ -135,7 +120,6 @@ def _of(terms: Terms, pairs: tuple[Pair, ...]) -> list[Pair]:
 
 
 def _headline(pairs: tuple[Pair, ...]) -> str:
-    """Return who predicts better, on equal terms and on the largest data set."""
     terms = next(t for t in _ABOUT if _of(t, pairs))
     parts = [
         f'{words} {" and ".join(names)}'
@@ -146,19 +130,18 @@ def _headline(pairs: tuple[Pair, ...]) -> str:
 
 
 def _against(pairs: list[Pair]) -> str:
-    """Return the error of each other method, and the result of the test over segments."""
     told = []
     for p in pairs:
         mse = p.mse_theirs_mw2
         said = f'{LABELS[p.baseline]} has ' + (
-            f'{plain(mse)} MW²' if math.isfinite(mse) else 'no finite error'
+            f'{say.plain(mse)} MW²' if math.isfinite(mse) else 'no finite error'
         )
-        tested = f'{_TESTED[p.outcome]}, {p_value(p.test.p_value)}'
+        tested = f'{_TESTED[p.outcome]}, {say.p_value(p.test.p_value)}'
         if not p.failed:
             told.append(f'{said} ({tested})')
             continue
         what = 'half hour' if p.terms is Terms.ALL_ROWS else 'segment'
-        said += f', and gives no finite answer in {p.failed} of {counted(p.judged, what)}'
+        said += f', and gives no finite answer in {p.failed} of {say.counted(p.judged, what)}'
         # The result without failures is reported if it differs.
         told.append(f'{said} (over the others {tested})' if p.test.zero_is_rejected() else said)
     return ' and '.join(told) + '.'
@@ -166,7 +149,7 @@ def _against(pairs: list[Pair]) -> str:
 
 def _truth_words(data: Compared) -> str:
     rmse = {method: error.rmse_mw for method, error in data.result.errors.items()}
-    listed = ', '.join(f'{LABELS[m]} {plain(e, 3)}' for m, e in rmse.items())
+    listed = ', '.join(f'{LABELS[m]} {say.plain(e, 3)}' for m, e in rmse.items())
     told = (
         f'Against the true curve the root mean square errors are, in MW: {listed}. '
         f'The nearest is {LABELS[min(rmse, key=lambda m: rmse[m])]}.'
@@ -175,7 +158,7 @@ def _truth_words(data: Compared) -> str:
     for b in others:
         times = rmse[b] / rmse['proposed'] if rmse['proposed'] > 0.0 else math.nan
         if math.isfinite(times):
-            told += f' The error of {LABELS[b]} is {plain(times, 2)} times that of valveflow.'
+            told += f' The error of {LABELS[b]} is {say.plain(times, 2)} times that of valveflow.'
     if 'paper' not in rmse:
         return told
     further = [LABELS[b] for b in others if rmse[b] > rmse['paper']]
@@ -194,76 +177,76 @@ def comparison_page(data: Compared) -> Page:
     """Return the report: the result and the curves first, then the evidence."""
     c = data.result.characteristic
     first, *rest = finding_words(data)
-    spans = [period(part.time_ns[0], part.time_ns[-1]) for part in (data.learnt, data.judged)]
+    spans = [say.period(part.time_ns[0], part.time_ns[-1]) for part in (data.learnt, data.judged)]
     shown = stretches(data)
     segments = [s for stretch in shown for s in stretch.segments]
-    moves = moves_figure(data)
     sections = [
-        Section('What came out', [
-            paragraph(text(first), 'answer'), curves_figure(data), pairs_table(data.result.pairs),
-            *(paragraph(text(sentence)) for sentence in rest),
-        ]),
-        Section('The curves', [parameters_table(data)]),
-        *([Section('Against the truth', [errors_table(data), truth_figure(data)])]
-          if data.result.truth is not None else []),
-        Section('On data nobody has seen', [
-            totals_table(data), *(stretch_figure(data, s) for s in shown),
-            *([segments_table(data, segments)] if segments else []),
-        ]),
-        Section('Dynamics by load', [
-            *([dynamics_table(c.dynamics)] if c.dynamics else []),
-            paragraph(text(_linear_block_words(data))), *([moves] if moves else []),
-        ]),
-        Section('Why this number of pieces', [choice_figure(c.choice, max(1, len(c.pieces)))]),
+        html.section(
+            'What came out', html.paragraph(html.text(first), 'answer'), curves_figure(data),
+            pairs_table(data.result.pairs),
+            *(html.paragraph(html.text(sentence)) for sentence in rest),
+        ),
+        html.section('The curves', parameters_table(data)),
+        html.section('Against the truth', errors_table(data), truth_figure(data))
+        if data.result.truth is not None else None,
+        html.section(
+            'On data nobody has seen', totals_table(data),
+            *(stretch_figure(data, s) for s in shown),
+            segments_table(data, segments) if segments else None,
+        ),
+        html.section(
+            'Dynamics by load', dynamics_table(c.dynamics) if c.dynamics else None,
+            html.paragraph(html.text(_linear_block_words(data))), moves_figure(data),
+        ),
+        html.section('Why this number of pieces', choice_figure(c.choice, max(1, len(c.pieces)))),
         _tuning(data),
+        html.section('How the data were read', html.bullets(map(html.text, data.notes)))
+        if data.notes else None,
     ]  # fmt: skip
-    if data.notes:
-        sections.append(Section('How the data were read', [bullets(map(text, data.notes))]))
-    end = foot(
-        f'Curve <code>{text(c.model_id)}</code>; the same numbers, unrounded, stand in '
+    end = html.foot(
+        f'Curve <code>{html.text(c.model_id)}</code>; the same numbers, unrounded, stand in '
         'comparison.json and the tables beside this page.'
     )
-    lead = where(data_words(data), ', and '.join(spans))
-    return Page('Three methods compared', lead, sections, end, 'compare')
+    lead = html.where(data_words(data), ', and '.join(spans))
+    return Page('Three methods compared', lead, [s for s in sections if s], end, 'compare')
 
 
 def _linear_block_words(data: Compared) -> str:
-    """Return the linear block of the Hammerstein model in words."""
     m = data.result.hammerstein.model
-    times = ', '.join(f'{plain(float(t), 3)} s' for t in m.time_constants_s)
+    times = ', '.join(f'{say.plain(float(t), 3)} s' for t in m.time_constants_s)
     return (
         f'The Hammerstein model has one linear block for all loads: '
         f'{_order(len(m.b), len(m.denominator))} (time constants {times or "none"}), delay '
-        f'{plain(m.delay * m.step_s, 3)} s.'
+        f'{say.plain(m.delay * m.step_s, 3)} s.'
     )
 
 
 def _order(taps: int, poles: int) -> str:
-    return f'{counted(taps, "tap")}, {counted(poles, "pole")}'
+    return f'{say.counted(taps, "tap")}, {say.counted(poles, "pole")}'
 
 
 def _tuning(data: Compared) -> Section:
     """Return the candidates for each baseline; a baseline without tuning is no fair comparison."""
     h, s = data.result.hammerstein, data.result.sparse
     rows = [
-        [f'Hammerstein, {_order(n_b, n_f)}', text(noise), plain(mse)]
+        [f'Hammerstein, {_order(n_b, n_f)}', html.text(noise), say.plain(mse)]
         for n_b, n_f, noise, mse in h.tried
     ]
     sparse = data.result.failure
     if s is not None:
         rows += [
-            [f'sparse, {text(kind)}, {window:g} s', f'{terms} functions', plain(mse)]
+            [f'sparse, {html.text(kind)}, {window:g} s', f'{terms} functions', say.plain(mse)]
             for kind, window, terms, mse in s.mse_by_form
         ]
         equation = ' '.join(
-            f'{"−" if x < 0.0 else "+"} {plain(abs(float(x)), 4)}{"" if n == "1" else f" {n}"}'
+            f'{"−" if x < 0.0 else "+"} {say.plain(abs(float(x)), 4)}{"" if n == "1" else f" {n}"}'
             for n, x in zip(NAMES, s.model.xi, strict=True)
             if x != 0.0
         )
         sparse = (
             f'Sparse identification took the equations in the form "{s.form.kind}" over '
-            f'{s.form.window_s:g} s and threshold {plain(s.threshold, 3)} on scaled columns. The '
-            f'model, with y in MW: dy/dt = {equation.removeprefix("+ ") or "0"} (MW/s).'
+            f'{s.form.window_s:g} s and threshold {say.plain(s.threshold, 3)} on scaled columns. '
+            f'The model, with y in MW: dy/dt = {equation.removeprefix("+ ") or "0"} (MW/s).'
         )
     words = (
         'Each was learnt from the first 70 % of the data learnt from and run freely over the '
@@ -272,11 +255,12 @@ def _tuning(data: Compared) -> Section:
         f'pieces as the proposed curve, and began at several sets of breakpoints. Chosen: '
         f'{h.noise}, {_order(len(h.model.b), len(h.model.denominator))}.'
     )
-    candidates = table(['candidate', '', 'mean squared error (MW²)'], rows)
-    return Section('How the other two were tuned', [
-        paragraph(text(words)), paragraph(text(sparse)),
-        folded(f'The {counted(len(rows), "candidate")}', candidates),
-    ])  # fmt: skip
+    candidates = html.table(['candidate', '', 'mean squared error (MW²)'], rows)
+    return html.section(
+        'How the other two were tuned', html.paragraph(html.text(words)),
+        html.paragraph(html.text(sparse)),
+        html.folded(f'The {say.counted(len(rows), "candidate")}', candidates),
+    )  # fmt: skip
 
 
 # Figs. 7 and 11 of the paper: the curves.
@@ -292,12 +276,11 @@ LOOK = {
 
 
 def _method_line(method: str, x: Any, y: Any, hover: str, **more: Any) -> Spec:
-    """Return a line in the style of a method."""
     colour, dash, width = LOOK[method]
     # A legend has little space.
     name = "the paper's curve" if method == 'paper' else LABELS[method]
     shared = {'legendgroup': method, 'showlegend': True, 'yaxis': 'y', **more}
-    return line(x, y, name, colour, hover, dash=dash, width=width, **shared)
+    return plot.line(x, y, name, colour, hover, dash=dash, width=width, **shared)
 
 
 def _cloud(contents: WindowContents, special: bool) -> Spec:
@@ -306,8 +289,8 @@ def _cloud(contents: WindowContents, special: bool) -> Spec:
     rows = rows[np.isfinite(contents.u[rows]) & np.isfinite(contents.power_mw[rows])]
     if len(rows) > _DOTS:
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, _DOTS).round().astype(np.int64))]
-    return points(
-        rounded(contents.u[rows]), rounded(contents.power_mw[rows], 4),
+    return plot.points(
+        plot.rounded(contents.u[rows]), plot.rounded(contents.power_mw[rows], 4),
         'special samples' if special else 'all samples', 'data-soft', size=2.5,
         marker={'opacity': 0.5},
     )  # fmt: skip
@@ -315,21 +298,21 @@ def _cloud(contents: WindowContents, special: bool) -> Spec:
 
 def _curves(data: Compared) -> list[Spec]:
     curves, hover = curves_of(data), 'u %{x:.0f}<br>%{y:.1f} MW'
-    u = rounded(curves['u'], 6)
+    u = plot.rounded(curves['u'], 6)
     traces = []
     if 'truth' in curves:
-        truth = rounded(curves['truth'], 6)
-        traces.append(line(u, truth, 'truth', 'density-2', hover, width=6, yaxis='y'))
+        truth = plot.rounded(curves['truth'], 6)
+        traces.append(plot.line(u, truth, 'truth', 'density-2', hover, width=6, yaxis='y'))
     return traces + [
-        _method_line(m, u, rounded(curves[m], 6), hover) for m in METHODS if m in curves
+        _method_line(m, u, plot.rounded(curves[m], 6), hover) for m in METHODS if m in curves
     ]
 
 
 def curves_figure(data: Compared) -> Figure:
     """Return the curves over the special samples of the test data (Fig. 7)."""
     layout = {
-        'xaxis': axis(input_axis(data.result.characteristic.pressure_exponent)),
-        'yaxis': axis('generated power (MW)'), 'showlegend': True,
+        'xaxis': plot.axis(say.input_axis(data.result.characteristic.pressure_exponent)),
+        'yaxis': plot.axis('generated power (MW)'), 'showlegend': True,
     }  # fmt: skip
     caption = (
         '<b>Every line should run through the cloud.</b> Grey: samples of special segments of '
@@ -343,17 +326,18 @@ def curves_figure(data: Compared) -> Figure:
 def truth_figure(data: Compared) -> Figure:
     """Return the curves over all samples, and their errors relative to the true one (Fig. 11)."""
     curves = curves_of(data)
-    u = rounded(curves['u'], 6)
+    u = plot.rounded(curves['u'], 6)
     traces = [_cloud(data.learnt, special=False), *_curves(data)]
     traces += [
-        _method_line(m, u, rounded(curves[m] - curves['truth'], 4), 'u %{x:.0f}<br>%{y:.2f} MW',
-                     yaxis='y2', showlegend=False)
+        _method_line(m, u, plot.rounded(curves[m] - curves['truth'], 4),
+                     'u %{x:.0f}<br>%{y:.2f} MW', yaxis='y2', showlegend=False)
         for m in METHODS if m in curves
     ]  # fmt: skip
+    m = data.result.characteristic.pressure_exponent
     layout = {
-        'xaxis': axis(input_axis(data.result.characteristic.pressure_exponent), anchor='y2'),
-        'yaxis': axis('power (MW)', domain=[0.44, 1.0]),
-        'yaxis2': axis('curve − truth (MW)', domain=[0.0, 0.38]), 'showlegend': True,
+        'xaxis': plot.axis(say.input_axis(m), anchor='y2'),
+        'yaxis': plot.axis('power (MW)', domain=[0.44, 1.0]),
+        'yaxis2': plot.axis('curve − truth (MW)', domain=[0.0, 0.38]), 'showlegend': True,
     }  # fmt: skip
     caption = (
         '<b>Below, a perfect curve would lie at zero.</b> Above, the same curves over all '
@@ -403,7 +387,6 @@ def stretches(data: Compared) -> list[Stretch]:
 
 
 def _means(values: FloatArray, first: int, end: int) -> FloatArray:
-    """Return means over short blocks, to limit the number of points."""
     block = max(1, (end - first) // _POINTS)
     usable = (end - first) // block * block
     with np.errstate(invalid='ignore'):
@@ -413,15 +396,16 @@ def _means(values: FloatArray, first: int, end: int) -> FloatArray:
 def _over_time(
     data: Compared, values: FloatArray, first: int, end: int
 ) -> tuple[list[float | None], list[float | None], str]:
-    """Return times, means of a power, and the hover text for both."""
-    at = rounded(_means(data.result.trial.time_ns[first:end] / 1e6, 0, end - first), 14)
+    at = plot.rounded(_means(data.result.trial.time_ns[first:end] / 1e6, 0, end - first), 14)
     known = np.where(np.isfinite(values), values, np.nan)
-    return at, rounded(_means(known, first, end)), '%{x|%d %b %H:%M:%S}<br>%{y:.1f} MW'
+    return at, plot.rounded(_means(known, first, end)), '%{x|%d %b %H:%M:%S}<br>%{y:.1f} MW'
 
 
 def _measured(data: Compared, first: int, end: int, **more: Any) -> Spec:
     x, y, hover = _over_time(data, data.judged.power_mw, first, end)
-    return line(x, y, 'measured', 'data-soft', hover, width=1.2, legendgroup='measured', **more)
+    return plot.line(
+        x, y, 'measured', 'data-soft', hover, width=1.2, legendgroup='measured', **more
+    )
 
 
 def _predicted(data: Compared, name: str, first: int, end: int, **more: Any) -> Spec:
@@ -443,11 +427,11 @@ def stretch_figure(data: Compared, stretch: Stretch) -> Figure:
     ]  # fmt: skip
     layout = {
         # Tick labels that rotate automatically would make the margins unstable.
-        'xaxis': time_axis(anchor='y2', tickangle=0, nticks=8),
-        'yaxis': axis('power (MW)', domain=[0.53, 1.0]),
-        'yaxis2': axis('power (MW)', domain=[0.0, 0.47], matches='y'),
+        'xaxis': plot.time_axis(anchor='y2', tickangle=0, nticks=8),
+        'yaxis': plot.axis('power (MW)', domain=[0.53, 1.0]),
+        'yaxis2': plot.axis('power (MW)', domain=[0.0, 0.47], matches='y'),
         'shapes': [
-            stripe(s.start_ns / 1e6, s.end_ns / 1e6, _COLOUR[s.kind], xref='x', opacity=0.14)
+            plot.stripe(s.start_ns / 1e6, s.end_ns / 1e6, _COLOUR[s.kind], xref='x', opacity=0.14)
             for s in stretch.segments
         ],
         'showlegend': True,
@@ -492,7 +476,7 @@ def moves_figure(data: Compared) -> Figure | None:
         x, y, hover = _over_time(data, data.result.predictions['proposed.static'], *span)
         traces += [
             _measured(data, *span, **place),
-            line(x, y, 'steam flow F(u)', 'chosen', hover, width=1.4, legendgroup='proposed',
+            plot.line(x, y, 'steam flow F(u)', 'chosen', hover, width=1.4, legendgroup='proposed',
                  **place),
             *(_predicted(data, name, *span, **place)
               for name in ('proposed.dynamic', 'hammerstein.dynamic')
@@ -502,11 +486,11 @@ def moves_figure(data: Compared) -> Figure | None:
         day = datetime.fromtimestamp(second, tz=timezone.utc)
         title = {'text': f'{load} power<br>{day:%d %b %Y} (UTC)',
                  'short': f'{load} power<br>{day:%d %b}'}  # fmt: skip
-        layout[f'xaxis{side}'] = axis(
+        layout[f'xaxis{side}'] = plot.axis(
             title, type='date', domain=domain, anchor=f'y{side}', nticks=3, tickformat='%H:%M',
             tickangle=0,
         )  # fmt: skip
-        layout[f'yaxis{side}'] = axis('' if side else 'power (MW)', anchor=f'x{side}')
+        layout[f'yaxis{side}'] = plot.axis('' if side else 'power (MW)', anchor=f'x{side}')
     caption = (
         '<b>How long the power lags behind the flow.</b> Where one block for all loads answers '
         'too slowly on the left or too quickly on the right, the dynamics differ between loads.'

@@ -14,9 +14,9 @@ from valveflow_ros.baselines.comparison import Comparison, Pair, Terms
 from valveflow_ros.baselines.judged import JudgedSegment, Judgement
 from valveflow_ros.baselines.truth import Line
 from valveflow_ros.records import FloatArray, SegmentKind
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
 from valveflow_ros.report.figure import csv_text
-from valveflow_ros.report.page import paragraph, table, text
-from valveflow_ros.report.words import decimals, interval, moment, p_value, plain, span
 from valveflow_ros.segments.window import WindowContents
 
 # In the order of the tables; the names in files, and those for people.
@@ -54,27 +54,15 @@ _PLACES = 500
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A comparison and its data.
+    """A comparison and its data."""
 
-    Attributes
-    ----------
-    source, other : str
-        Names of the logs for fitting and for testing.
-    held_out : bool
-        True if both are parts of one log.
-    result : Comparison
-    learnt, judged : WindowContents
-    notes : tuple of str
-        Sentences about how the data were read.
-    """
-
-    source: str
-    other: str
-    held_out: bool
+    source: str  # name of the log for fitting
+    other: str  # and of that for testing
+    held_out: bool  # both are parts of one log
     result: Comparison
     learnt: WindowContents
     judged: WindowContents
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # about how the data were read
 
     @property
     def predictions(self) -> tuple[str, ...]:
@@ -84,11 +72,10 @@ class Compared:
 
 def mse_cell(value: float) -> str:
     """Return a mean squared error as text: '∞' if the prediction diverged, '–' if missing."""
-    return plain(value) if math.isfinite(value) else '∞' if math.isinf(value) else '–'
+    return say.plain(value) if math.isfinite(value) else '∞' if math.isinf(value) else '–'
 
 
 def _pieces(data: Compared) -> Iterator[tuple[str, int, Line]]:
-    """Yield each piece of each curve with pieces: method, index of the piece, curve."""
     for method in METHODS:
         if (line := data.result.lines.get(method)) is not None:
             for j in range(len(line.slopes)):
@@ -99,14 +86,14 @@ def parameters_table(data: Compared) -> str:
     """Return Table II: slopes, intercepts and pieces of the curves that have them."""
     rows = [
         [
-            '' if j else text(LABELS[method]), str(j + 1), plain(float(line.slopes[j])),
-            decimals(float(line.intercepts[j]), 2),
-            span(line.knots[j], line.knots[j + 1], 1),
+            '' if j else html.text(LABELS[method]), str(j + 1), say.plain(float(line.slopes[j])),
+            say.decimals(float(line.intercepts[j]), 2),
+            say.span(line.knots[j], line.knots[j + 1], 1),
         ]
         for method, j, line in _pieces(data)
     ]  # fmt: skip
     head = ['method', 'piece', 'slope (MW per unit of u)', 'intercept (MW)', 'u']
-    return table(head, rows, caption="As in the paper's Table II.")
+    return html.table(head, rows, caption="As in the paper's Table II.")
 
 
 def errors_table(data: Compared) -> str:
@@ -119,20 +106,21 @@ def errors_table(data: Compared) -> str:
         if len(line.slopes) == len(truth.slopes):
             last = j + 1 == len(line.slopes)
             rows.append([
-                '' if j else text(LABELS[method]), str(j + 1),
-                *(plain(float(c.slopes[j])) for c in (line, truth)),
-                *(decimals(float(c.intercepts[j]), 2) for c in (line, truth)),
-                *('' if last else decimals(float(c.knots[j + 1]), 1) for c in (line, truth)),
+                '' if j else html.text(LABELS[method]), str(j + 1),
+                *(say.plain(float(c.slopes[j])) for c in (line, truth)),
+                *(say.decimals(float(c.intercepts[j]), 2) for c in (line, truth)),
+                *('' if last else say.decimals(float(c.knots[j + 1]), 1) for c in (line, truth)),
             ])  # fmt: skip
     head = [
         'method', 'piece', 'slope', 'true slope', 'intercept (MW)', 'true intercept (MW)',
         'breakpoint', 'true breakpoint',
     ]  # fmt: skip
-    told = table(head, rows, caption="As in the paper's Table IV.") if rows else ''
+    told = html.table(head, rows, caption="As in the paper's Table IV.") if rows else ''
     rows = [
         [
-            text(LABELS[m]), plain(e.rmse_mw, 3), plain(e.largest_mw, 3),
-            *(plain(v, 2) if math.isfinite(v) else '–' for v in (e.slope, e.knee, e.intercept)),
+            html.text(LABELS[m]), say.plain(e.rmse_mw, 3), say.plain(e.largest_mw, 3),
+            *(say.plain(v, 2) if math.isfinite(v) else '–'
+              for v in (e.slope, e.knee, e.intercept)),
         ]
         for m, e in data.result.errors.items()
     ]  # fmt: skip
@@ -140,7 +128,9 @@ def errors_table(data: Compared) -> str:
         'method', 'curve, rms (MW)', 'curve, largest (MW)', 'largest slope error',
         'largest breakpoint error', 'largest intercept error (MW)',
     ]  # fmt: skip
-    return told + table(head, rows, caption='Errors against the truth, where the curve is known.')
+    return told + html.table(
+        head, rows, caption='Errors against the truth, where the curve is known.'
+    )
 
 
 def totals_table(data: Compared) -> str:
@@ -150,10 +140,10 @@ def totals_table(data: Compared) -> str:
     for name in data.predictions:
         bias = j.bias(name)
         rows.append([
-            text(PREDICTIONS[name]),
+            html.text(PREDICTIONS[name]),
             *(mse_cell(j.mse(name, k)) for k in (None, SegmentKind.STEADY, SegmentKind.SLOPE)),
             mse_cell(all_rows.get(name, math.nan)),
-            f'{decimals(bias.mean, 3)} ({p_value(bias.p_value)})'
+            f'{say.decimals(bias.mean, 3)} ({say.p_value(bias.p_value)})'
             if math.isfinite(bias.mean) else '–',
             *('{} of {}'.format(*j.passed(name, as_paper=paper)) for paper in (True, False)),
         ])  # fmt: skip
@@ -162,21 +152,21 @@ def totals_table(data: Compared) -> str:
         'mean difference (MW)', 'zero stands, each sample counted',
         'zero stands, correlation counted',
     ]  # fmt: skip
-    return table(head, rows, caption='Mean squared errors on the test data.')
+    return html.table(head, rows, caption='Mean squared errors on the test data.')
 
 
 def pairs_table(pairs: Sequence[Pair]) -> str:
     """Return which method is better, and on which terms."""
     rows = []
     for p in sorted(pairs, key=lambda p: list(_TERMS).index(p.terms)):
-        tested = p_value(p.test.p_value)
+        tested = say.p_value(p.test.p_value)
         if p.failed:
             # The verdict is based on these failures, not only on the test.
             told = f'theirs has no finite answer in {p.failed} of {p.judged}'
             tested = f'{told}; the others: {tested}'
         rows.append([
-            _TERMS[p.terms], text(LABELS[p.baseline]), mse_cell(p.mse_ours_mw2),
-            mse_cell(p.mse_theirs_mw2), interval(*p.test.interval()),
+            _TERMS[p.terms], html.text(LABELS[p.baseline]), mse_cell(p.mse_ours_mw2),
+            mse_cell(p.mse_theirs_mw2), say.interval(*p.test.interval()),
             f'<b>{p.outcome.value}</b>, {tested}',
         ])  # fmt: skip
     head = [
@@ -187,7 +177,7 @@ def pairs_table(pairs: Sequence[Pair]) -> str:
         "The paper's way: its static curve against simulations of the others, all special "
         'segments. Otherwise like against like, and ours is valveflow.'
     )
-    return paragraph(words) + table(head, rows)
+    return html.paragraph(words) + html.table(head, rows)
 
 
 def segments_table(data: Compared, segments: Sequence[JudgedSegment]) -> str:
@@ -199,22 +189,22 @@ def segments_table(data: Compared, segments: Sequence[JudgedSegment]) -> str:
         each, worth = score.samples.t, score.effective.t
         if not (math.isfinite(each) or math.isfinite(worth)):
             return mse_cell(score.mse_mw2)
-        return f'{mse_cell(score.mse_mw2)} ({plain(each, 2)}; {plain(worth, 2)})'
+        return f'{mse_cell(score.mse_mw2)} ({say.plain(each, 2)}; {say.plain(worth, 2)})'
 
     rows = [
         [
-            f'{KIND[s.kind]} {s.number}', moment(s.start_ns)[5:16], str(len(s.rows)),
-            decimals(s.power_mw, 0), *(cell(s, n) for n in names),
+            f'{KIND[s.kind]} {s.number}', say.moment(s.start_ns)[5:16], str(len(s.rows)),
+            say.decimals(s.power_mw, 0), *(cell(s, n) for n in names),
         ]
         for s in segments
     ]  # fmt: skip
-    head = ['segment', 'from', 'samples', 'MW', *(text(_SHORT[n]) for n in names)]
+    head = ['segment', 'from', 'samples', 'MW', *(html.text(_SHORT[n]) for n in names)]
     words = (
         "As the paper's Table III, for the segments shown: mean squared error in MW², and in "
         'brackets the t value of a mean difference of zero, first with each sample counted, then '
         'with what correlated samples are worth. All segments stand in segments.csv.'
     )
-    return paragraph(words) + table(head, rows)
+    return html.paragraph(words) + html.table(head, rows)
 
 
 def segments_csv(judgement: Judgement, names: Sequence[str]) -> str:

@@ -12,36 +12,13 @@ from valveflow_ros.curve.characteristic import Piece
 from valveflow_ros.curve.segment_residual import SegmentResiduals, segment_residuals
 from valveflow_ros.curve.shift import PieceShift, Shift
 from valveflow_ros.records import FloatArray, IntArray, Signal
-from valveflow_ros.report.figure import (
-    DAY_HOUR,
-    Figure,
-    Spec,
-    area,
-    axis,
-    error_bars,
-    line,
-    packed,
-    points,
-    rounded,
-    stripe,
-    time_axis,
-    token,
-    upright,
-    zero_line,
-)
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
+from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.page import Section, notice, paragraph, table, text
-from valveflow_ros.report.words import (
-    Z95,
-    counted,
-    decimals,
-    input_axis,
-    input_unit,
-    moment,
-    plain,
-    span,
-    with_error,
-)
+from valveflow_ros.report.page import Section
+from valveflow_ros.report.words import Z95
 from valveflow_ros.signals.static_form import OPENING
 
 _SHADES = 5
@@ -91,32 +68,30 @@ def curve_figure(data: Identified) -> Figure:
     if len(c.pieces) > 1:
         traces.append(_breakpoints(data))
     layout: Spec = {
-        'xaxis': axis(input_axis(c.pressure_exponent)),
-        'yaxis': axis(f'generated power{data.at_pressure} (MW)'),
+        'xaxis': plot.axis(say.input_axis(c.pressure_exponent)),
+        'yaxis': plot.axis(f'generated power{data.at_pressure} (MW)'),
     }  # fmt: skip
     if (day := last_range(data)) is not None:
-        layout['shapes'] = [stripe(*day, 'today')]
-        layout['annotations'] = [
-            {
-                'text': 'last day', 'showarrow': False, 'x': day[1], 'xanchor': 'right',
-                'yref': 'paper', 'y': 0.01, 'yanchor': 'bottom', 'font': {'color': token('muted')},
-            }
-        ]  # fmt: skip
+        layout['shapes'] = [plot.stripe(*day, 'today')]
+        layout['annotations'] = [{
+            'text': 'last day', 'showarrow': False, 'x': day[1], 'xanchor': 'right',
+            'yref': 'paper', 'y': 0.01, 'yanchor': 'bottom',
+            'font': {'color': plot.token('muted')},
+        }]  # fmt: skip
     ends, values = c.breakpoints, c.values()
     words = (
-        f'Flow characteristic of {counted(len(c.pieces), "piece")} from u {plain(float(ends[0]))} '
-        f'({plain(float(values[0]))} MW) to u {plain(float(ends[-1]))} '
-        f'({plain(float(values[-1]))} MW), over the density of special samples.'
+        f'Flow characteristic of {say.counted(len(c.pieces), "piece")} from u '
+        f'{say.plain(float(ends[0]))} ({say.plain(float(values[0]))} MW) to u '
+        f'{say.plain(float(ends[-1]))} ({say.plain(float(values[-1]))} MW), over the density of '
+        'special samples.'
     )
     return Figure('curve', _caption(data), words, traces, layout, height=500)
 
 
 def opening_figure(data: Identified) -> Figure | None:
     """Return the power over the opening at typical pressures; None if the pressure is unknown."""
-    opening, pressure = (
-        data.table.column(signal)[data.special]
-        for signal in (Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE)
-    )
+    wanted = [Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]
+    opening, pressure = data.table.values[data.special][:, wanted].T
     known = np.isfinite(opening) & (pressure > 0.0)
     if not known.any():
         return None
@@ -124,9 +99,10 @@ def opening_figure(data: Identified) -> Figure | None:
     wide = high - low > _SAME_PRESSURE * middle
     v = np.linspace(float(opening[known].min()), float(opening[known].max()), _OPENINGS)
     traces = [
-        line(
-            rounded(v), rounded(data.characteristic.power(v, p)), f'at {p:.3g} MPa', colour,
-            'opening %{x:.3~g} %<br>%{y:.4~g} MW', width=2.6 if p == middle else 1.6, dash=dash,
+        plot.line(
+            plot.rounded(v), plot.rounded(data.characteristic.power(v, p)), f'at {p:.3g} MPa',
+            colour, 'opening %{x:.3~g} %<br>%{y:.4~g} MW', width=2.6 if p == middle else 1.6,
+            dash=dash,
         )
         for p, colour, dash in (
             (high, 'chosen', 'dot'), (middle, 'curve', ''), (low, 'raw', 'dash')
@@ -139,7 +115,7 @@ def opening_figure(data: Identified) -> Figure | None:
         + (', and at its 5 % and 95 % quantiles.' if wide else '.')
     )
     words = f'Power against the valve opening at {middle:.3g} MPa.'
-    layout = {'xaxis': axis('valve opening (%)'), 'yaxis': axis('generated power (MW)')}
+    layout = {'xaxis': plot.axis('valve opening (%)'), 'yaxis': plot.axis('generated power (MW)')}
     return Figure('opening', caption, words, traces, layout, height=360)
 
 
@@ -152,9 +128,8 @@ def _caption(data: Identified) -> str:
     if data.at_pressure:
         parts.append(
             'The breakpoints of this valve are at fixed openings; the power is '
-            f'shown{data.at_pressure}, at '
-            'other pressures p the part without the constant c is proportional to p^'
-            f'{data.characteristic.pressure_scale_exponent:.3g}.'
+            f'shown{data.at_pressure}, at other pressures p the part without the constant c is '
+            f'proportional to p^{data.characteristic.pressure_scale_exponent:.3g}.'
         )
     if len(c.pieces) > 1:
         parts.append(
@@ -184,14 +159,15 @@ def _line(
     pieces: tuple[Piece, ...], name: str, colour: str, width: float, dash: str = '',
     hover: str = 'u %{x:.4~g}<br>%{y:.4~g} MW',
 ) -> Spec:  # fmt: skip
-    """Return the lines of all pieces, separated by gaps."""
     x = [v for p in pieces for v in (p.u_from, p.u_to, math.nan)]
     y = [
         v for p in pieces
         for v in (p.slope * p.u_from + p.intercept, p.slope * p.u_to + p.intercept, math.nan)
     ]  # fmt: skip
     told = f'{hover}<extra>{name}</extra>' if hover else ''
-    return line(rounded(x, 7), rounded(y, 7), name, colour, told, width=width, dash=dash)
+    return plot.line(
+        plot.rounded(x, 7), plot.rounded(y, 7), name, colour, told, width=width, dash=dash
+    )
 
 
 def density(
@@ -235,7 +211,7 @@ def _heat(u: FloatArray, power: FloatArray) -> Spec:
         'x0': x0, 'dx': dx, 'y0': y0, 'dy': dy,
         'z': [[c or None for c in row] for row in counts.tolist()],
         'zmin': 1, 'zmax': max(2, most), 'hoverongaps': False,
-        'colorscale': [[float(p), token(f'density-{k}')] for k, p in enumerate(places)],
+        'colorscale': [[float(p), plot.token(f'density-{k}')] for k, p in enumerate(places)],
         'hovertemplate': 'u %{x:.4~g}<br>%{y:.4~g} MW<br>%{z} samples<extra></extra>',
     }  # fmt: skip
 
@@ -248,8 +224,8 @@ def _bands(data: Identified, u_samples: FloatArray) -> list[Spec]:
         if np.all(np.isfinite(error)):
             middle = piece.slope * u + piece.intercept
             edge = np.append(middle + error, (middle - error)[::-1])
-            traces.append(area(
-                rounded(np.append(u, u[::-1]), 6), rounded(edge, 6), '95 % band',
+            traces.append(plot.area(
+                plot.rounded(np.append(u, u[::-1]), 6), plot.rounded(edge, 6), '95 % band',
                 legendgroup='band', showlegend=not traces,
             ))  # fmt: skip
     return traces
@@ -260,15 +236,16 @@ def _breakpoints(data: Identified) -> Spec:
     u, x = c.breakpoints[1:-1], c.values()[1:-1]
     low, high = np.array(c.breakpoint_intervals, dtype=np.float64).reshape(-1, 2).T
     hover = [
-        f'breakpoint at u {plain(float(b), 5)}'
-        + (f'<br>95 %: {plain(float(lo), 5)} to {plain(float(hi), 5)}'
+        f'breakpoint at u {say.plain(float(b), 5)}'
+        + (f'<br>95 %: {say.plain(float(lo), 5)} to {say.plain(float(hi), 5)}'
            if math.isfinite(lo) and math.isfinite(hi) else '')
         for b, lo, hi in zip(u, low, high, strict=True)
     ]  # fmt: skip
-    return points(
-        rounded(u, 7), rounded(x, 7), 'breakpoints, 95 %', 'paper', size=9,
-        marker={'line': {'color': token('curve'), 'width': 2}}, hovertext=hover, hoverinfo='text',
-        error_x=error_bars(low, u, high, thickness=2, width=5, color=token('curve')),
+    return plot.points(
+        plot.rounded(u, 7), plot.rounded(x, 7), 'breakpoints, 95 %', 'paper', size=9,
+        marker={'line': {'color': plot.token('curve'), 'width': 2}}, hovertext=hover,
+        hoverinfo='text',
+        error_x=plot.error_bars(low, u, high, thickness=2, width=5, color=plot.token('curve')),
     )  # fmt: skip
 
 
@@ -294,20 +271,20 @@ def segments_figure(data: Identified) -> Figure | None:
     found = segment_residuals(c, data.segments)
     if len(found) < _LEAST:
         return None
-    unit = input_unit(c.pressure_exponent)
-    y, marker = rounded(found.residual_mw), {'opacity': 0.75}
+    unit = say.input_unit(c.pressure_exponent)
+    y, marker = plot.rounded(found.residual_mw), {'opacity': 0.75}
     traces = [
-        points(rounded(found.u, 6), y, 'over u', 'chosen',
+        plot.points(plot.rounded(found.u, 6), y, 'over u', 'chosen',
                f'u %{{x:.4~g}} {unit}<br>%{{y:+.3~g}} MW<extra></extra>', marker=marker),
-        points(packed(found.time_ns / 1e6), y, 'over time', 'chosen',
+        plot.points(plot.packed(found.time_ns / 1e6), y, 'over time', 'chosen',
                f'{DAY_HOUR}%{{y:+.3~g}} MW<extra></extra>', marker=marker, xaxis='x2', yaxis='y2'),
     ]  # fmt: skip
     layout: Spec = {
-        'xaxis': axis(f'u ({unit})', domain=[0.0, 0.47], anchor='y'),
-        'xaxis2': time_axis(domain=[0.53, 1.0], anchor='y2', nticks=4),
-        'yaxis': axis('measured less curve (MW)'),
+        'xaxis': plot.axis(f'u ({unit})', domain=[0.0, 0.47], anchor='y'),
+        'xaxis2': plot.time_axis(domain=[0.53, 1.0], anchor='y2', nticks=4),
+        'yaxis': plot.axis('measured less curve (MW)'),
         'yaxis2': {'anchor': 'x2', 'matches': 'y', 'showticklabels': False},
-        'shapes': [zero_line(0.0, 0.47, yref='y'), zero_line(0.53, 1.0, yref='y2')],
+        'shapes': [plot.zero_line(0.0, 0.47, yref='y'), plot.zero_line(0.53, 1.0, yref='y2')],
         'showlegend': False,
     }
     caption = (
@@ -316,8 +293,8 @@ def segments_figure(data: Identified) -> Figure | None:
         'right: the unit changed while the data were taken, and diagnose may say why.'
     )
     words = (
-        f'Mean residual of {counted(len(found), "segment")} over u and over time; they spread '
-        f'by {plain(float(np.std(found.residual_mw)), 2)} MW.'
+        f'Mean residual of {say.counted(len(found), "segment")} over u and over time; they spread '
+        f'by {say.plain(float(np.std(found.residual_mw)), 2)} MW.'
     )
     return Figure('residuals', caption, words, traces, layout, height=340)
 
@@ -327,14 +304,14 @@ def shift_section(data: Identified) -> Section | None:
     shift = data.shift
     if shift is None or data.reference is None:
         return None
-    told = text(shift.sentence)
+    told = html.text(shift.sentence)
     head = [
         'piece', 'u', 'moved', 'now (MW)', '% of flow', 'curves differ in the middle by (MW)',
         'along the piece (MW)', 'confidence', 'smallest shift seen (MW)',
     ]  # fmt: skip
     parts: list[str | Figure] = [
-        notice(told) if shift.moved else paragraph(told),
-        table(head, [_row(k, piece) for k, piece in enumerate(shift.pieces, 1)]),
+        html.notice(told) if shift.moved else html.paragraph(told),
+        html.table(head, [_row(k, piece) for k, piece in enumerate(shift.pieces, 1)]),
     ]
     found = segment_residuals(data.reference, data.segments)
     if len(found):
@@ -347,30 +324,24 @@ def _row(number: int, p: PieceShift) -> list[str]:
         return [str(number), 'not in the reference', *[''] * 7]
     sure = f'> {100.0 * _SURE:g} %' if p.confidence > _SURE else f'{100.0 * p.confidence:.1f} %'
     return [
-        str(number),
-        span(p.u_from, p.u_to),
-        '<b>yes</b>' if p.moved else 'no',
-        with_error(p.now_mw, p.now_error_mw) if math.isfinite(p.now_mw) else '–',
-        decimals(p.percent, 2) if p.moved else '–',
-        with_error(p.middle_mw, p.error_mw),
-        span(p.low_mw, p.high_mw, 2),
-        sure,
-        plain(p.smallest_mw, 2),
-    ]
+        str(number), say.span(p.u_from, p.u_to), '<b>yes</b>' if p.moved else 'no',
+        say.with_error(p.now_mw, p.now_error_mw) if math.isfinite(p.now_mw) else '–',
+        say.decimals(p.percent, 2) if p.moved else '–', say.with_error(p.middle_mw, p.error_mw),
+        say.span(p.low_mw, p.high_mw, 2), sure, say.plain(p.smallest_mw, 2),
+    ]  # fmt: skip
 
 
 def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
-    """Return the difference of each segment from the reference over time."""
     moved = np.zeros(len(found), dtype=bool)
     for p in shift.pieces:
         if p.moved:
             moved |= (found.u >= p.u_from) & (found.u < p.u_to)
     looks = ((~moved, 'pieces that did not move', 'data'), (moved, 'pieces that moved', 'steady'))
     traces = [
-        points(
-            packed(part.time_ns / 1e6), rounded(part.residual_mw), name, colour,
+        plot.points(
+            plot.packed(part.time_ns / 1e6), plot.rounded(part.residual_mw), name, colour,
             f'{DAY_HOUR}u %{{customdata:.4~g}}<br>%{{y:+.3~g}} MW<extra>{name}</extra>',
-            customdata=rounded(part.u),
+            customdata=plot.rounded(part.u),
         )
         for keep, name, colour in looks if keep.any() for part in (found.part(keep),)
     ]  # fmt: skip
@@ -378,17 +349,17 @@ def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
         '<b>Without a shift the points scatter about zero.</b> Each is a special segment, '
         'measured less what the reference gives.'
     )
-    shapes = [zero_line()]
+    shapes = [plot.zero_line()]
     if shift.since_ns:
         caption += (
-            f' The line marks the change, {moment(shift.since_ns)}; shaded, where it lies with '
-            '95 % confidence.'
+            f' The line marks the change, {say.moment(shift.since_ns)}; shaded, where it lies '
+            'with 95 % confidence.'
         )
         shapes += [
-            stripe(shift.since_low_ns / 1e6, shift.since_high_ns / 1e6, 'band'),
-            upright(shift.since_ns / 1e6, 'chosen', 2),
+            plot.stripe(shift.since_low_ns / 1e6, shift.since_high_ns / 1e6, 'band'),
+            plot.upright(shift.since_ns / 1e6, 'chosen', 2),
         ]
     about = 'Difference of each special segment from the reference curve over time.'
-    layout = {'xaxis': time_axis(), 'yaxis': axis('measured less reference (MW)'),
+    layout = {'xaxis': plot.time_axis(), 'yaxis': plot.axis('measured less reference (MW)'),
               'shapes': shapes, 'hovermode': 'closest'}  # fmt: skip
     return Figure('shift', caption, about, traces, layout, height=380)

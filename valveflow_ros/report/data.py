@@ -18,31 +18,10 @@ from valveflow_ros.records import (
     SegmentKind,
     SignalInfo,
 )
-from valveflow_ros.report.figure import (
-    DAY_HOUR,
-    Figure,
-    Spec,
-    axis,
-    envelope,
-    line,
-    moments,
-    packed,
-    rounded,
-    time_axis,
-    token,
-    upright,
-)
-from valveflow_ros.report.page import paragraph, table
-from valveflow_ros.report.words import (
-    count,
-    counted,
-    duration,
-    input_axis,
-    input_unit,
-    moment,
-    percent,
-    plain,
-)
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
+from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
 
 if TYPE_CHECKING:
     from valveflow_ros.report.identified import Identified
@@ -107,18 +86,18 @@ def usable_share(table: SampleTable) -> float:
 def quality_words(data: Identified) -> str:
     """Return a paragraph on the data quality for an engineer."""
     words = (
-        f'{counted(len(data.table), "row")} of {duration(data.period_ns / 1e9)}; opening, '
-        f'pressure and power are all known in {percent(usable_share(data.table))} of them. '
+        f'{say.counted(len(data.table), "row")} of {say.duration(data.period_ns / 1e9)}; opening, '
+        f'pressure and power are all known in {say.percent(usable_share(data.table))} of them. '
     )
     found = gaps(data.table.time_ns, data.period_ns)
     words += (
-        f'Rows are missing in {counted(len(found), "place")}; the longest gap lasts '
-        f'{duration(found[0].seconds)} from {moment(found[0].start_ns)}. '
+        f'Rows are missing in {say.counted(len(found), "place")}; the longest gap lasts '
+        f'{say.duration(found[0].seconds)} from {say.moment(found[0].start_ns)}. '
         if found else 'No row is missing. '
     )  # fmt: skip
     refused = rejected(data.counts)
-    told = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
-    return paragraph(
+    told = ', '.join(f'{say.count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
+    return html.paragraph(
         words + (f'Readings not used: {told}.' if refused else 'Every reading was used.')
     )
 
@@ -132,7 +111,7 @@ def quality_table(data: Identified) -> str:
         'signal', 'readings', *(REASON_WORDS[r] for r in reasons),
         'rows with a value', 'lowest', 'median', 'highest',
     ]  # fmt: skip
-    return table(head, [_row(info, data, reasons) for info in sent])
+    return html.table(head, [_row(info, data, reasons) for info in sent])
 
 
 def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
@@ -142,13 +121,12 @@ def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
     low, middle, high = np.quantile(known, (0.0, 0.5, 1.0)) if len(known) else (np.nan,) * 3
     return [
         info.topic.replace('_', ' '),
-        count(sum(n for reason, n in counts.items() if reason != 'late')),
-        *(count(counts.get(reason, 0)) for reason in reasons),
-        percent(len(known) / len(values) if len(values) else float('nan')),
-        plain(float(low)),
-        plain(float(middle)),
-        f'{plain(float(high))} {info.unit.replace("degC", "°C")}',
-    ]
+        say.count(sum(n for reason, n in counts.items() if reason != 'late')),
+        *(say.count(counts.get(reason, 0)) for reason in reasons),
+        say.percent(len(known) / len(values) if len(values) else float('nan')),
+        say.plain(float(low)), say.plain(float(middle)),
+        f'{say.plain(float(high))} {info.unit.replace("degC", "°C")}',
+    ]  # fmt: skip
 
 
 def coverage_figure(data: Identified) -> Figure | None:
@@ -159,12 +137,12 @@ def coverage_figure(data: Identified) -> Figure | None:
     edges = np.histogram_bin_edges(known, bins=_BINS)
     every, _ = np.histogram(known, bins=edges)
     special, _ = np.histogram(data.u[data.special], bins=edges)
-    x = rounded(0.5 * (edges[1:] + edges[:-1]), 6)
+    x = plot.rounded(0.5 * (edges[1:] + edges[:-1]), 6)
     hours = data.period_ns / 3600e9
     traces: list[Spec] = [
         {
-            'type': 'bar', 'name': name, 'x': x, 'y': rounded(rows * hours, 4),
-            'marker': {'color': token(colour)},
+            'type': 'bar', 'name': name, 'x': x, 'y': plot.rounded(rows * hours, 4),
+            'marker': {'color': plot.token(colour)},
             'hovertemplate': f'u %{{x:.0f}}<br>%{{y:.2f}} h<extra>{name}</extra>',
         }
         for rows, name, colour in (
@@ -173,76 +151,60 @@ def coverage_figure(data: Identified) -> Figure | None:
     ]  # fmt: skip
     c = data.characteristic
     layout: Spec = {
-        'xaxis': axis(input_axis(c.pressure_exponent)),
-        'yaxis': axis('time there (h)', rangemode='tozero'),
+        'xaxis': plot.axis(say.input_axis(c.pressure_exponent)),
+        'yaxis': plot.axis('time there (h)', rangemode='tozero'),
         'barmode': 'stack', 'bargap': 0, 'showlegend': True,
-        'shapes': [upright(float(u), 'curve', 1.5, dash='dot') for u in c.breakpoints[1:-1]],
+        'shapes': [plot.upright(float(u), 'curve', 1.5, dash='dot') for u in c.breakpoints[1:-1]],
     }  # fmt: skip
-    share = percent(len(data.special) / len(known), 2)
+    share = say.percent(len(data.special) / len(known), 2)
     caption = (
         '<b>Every piece needs special segments.</b> How long the unit ran at each u; blue, the '
-        'part in '
-        f'special segments, {share} of all. Dotted, the breakpoints. Where there is '
+        f'part in special segments, {share} of all. Dotted, the breakpoints. Where there is '
         'little blue, more data at that load would make the curve more certain.'
     )
     words = (
-        f'Hours by u from {plain(float(edges[0]))} to {plain(float(edges[-1]))}; '
+        f'Hours by u from {say.plain(float(edges[0]))} to {say.plain(float(edges[-1]))}; '
         f'{share} of the time lies in special segments.'
     )
     return Figure('coverage', caption, words, traces, layout, height=320)
 
 
-def _sent(data: Identified) -> list[SignalInfo]:
-    return [i for i in SIGNALS if np.isfinite(data.table.column(i.signal)).any()]
-
-
-def presence(data: Identified) -> tuple[FloatArray, FloatArray]:
-    """Return the fraction of expected rows that have a value, by signal and time interval.
-
-    Returns
-    -------
-    edges_ns : float64 (k + 1,)
-    share : float64 (signals, k)
-        0 to 1; a missing row counts as one without a value.
-    """
+def presence_figure(data: Identified) -> Figure | None:
+    """Return when values are missing; None if none are missing."""
+    sent = [i for i in SIGNALS if np.isfinite(data.table.column(i.signal)).any()]
+    if len(data.table) < 2 or not sent:
+        return None
     time_ns = data.table.time_ns
     span = int(time_ns[-1] - time_ns[0]) + data.period_ns
     k = max(1, min(_STRETCHES, span // (20 * data.period_ns)))
     edges = np.linspace(0.0, float(span), k + 1)
     place = np.minimum(((time_ns - time_ns[0]) / (span / k)).astype(np.int64), k - 1)
+    # A missing row counts as one without a value.
     expected = np.maximum(np.diff(np.ceil(edges / data.period_ns)), 1.0)
     known = np.isfinite(data.table.values)
-    rows = [np.bincount(place[known[:, i.signal]], minlength=k) for i in _sent(data)]
-    counts = np.array(rows, dtype=np.float64).reshape(-1, k)
-    return float(time_ns[0]) + edges, np.minimum(counts / expected, 1.0)
-
-
-def presence_figure(data: Identified) -> Figure | None:
-    """Return when values are missing; None if none are missing."""
-    if len(data.table) < 2:
+    counts = np.array([np.bincount(place[known[:, i.signal]], minlength=k) for i in sent])
+    share, edges = np.minimum(counts / expected, 1.0), edges + float(time_ns[0])
+    if share.min() >= _WHOLE:
         return None
-    edges, share = presence(data)
-    if not share.size or share.min() >= _WHOLE:
-        return None
-    names = [i.topic.replace('_', ' ') for i in _sent(data)]
+    names = [i.topic.replace('_', ' ') for i in sent]
     scale = ((0.0, 'steady'), (0.5, 'notice-rule'), (0.999, 'notice'), (1.0, 'density-1'))
     traces: list[Spec] = [
         {
-            'type': 'heatmap', 'x': moments(edges / 1e6), 'y': names, 'ygap': 3,
-            'z': [rounded(100.0 * row, 3) for row in share], 'zmin': 0, 'zmax': 100,
-            'colorscale': [[place, token(colour)] for place, colour in scale],
+            'type': 'heatmap', 'x': plot.moments(edges / 1e6), 'y': names, 'ygap': 3,
+            'z': [plot.rounded(100.0 * row, 3) for row in share], 'zmin': 0, 'zmax': 100,
+            'colorscale': [[place, plot.token(colour)] for place, colour in scale],
             'showscale': False,
             'hovertemplate': f'{DAY_HOUR}%{{y}}: %{{z:.0f}} % there<extra></extra>',
         }
     ]  # fmt: skip
     layout: Spec = {
-        'xaxis': time_axis(), 'yaxis': {'type': 'category', 'autorange': 'reversed'},
+        'xaxis': plot.time_axis(), 'yaxis': {'type': 'category', 'autorange': 'reversed'},
     }  # fmt: skip
     caption = (
         '<b>Blue: complete. Yellow to red: values are missing then.</b> Missing are times '
         'without any row and values that were refused; the table above counts them by reason.'
     )
-    gone = percent(float((1.0 - share).max()), 2)
+    gone = say.percent(float((1.0 - share).max()), 2)
     words = f'Share of values there by signal and time; at worst {gone} are missing.'
     return Figure('presence', caption, words, traces, layout, height=110 + 34 * len(names))
 
@@ -257,7 +219,7 @@ _KINDS = (
 
 def signals_figure(data: Identified) -> Figure:
     """Return u and power over time (Fig. 5 of the paper)."""
-    unit = input_unit(data.characteristic.pressure_exponent)
+    unit = say.input_unit(data.characteristic.pressure_exponent)
     time_ns = data.table.time_ns
     days = (int(time_ns[-1]) - int(time_ns[0])) / 86400e9 if len(time_ns) else 0.0
     # Buttons for the last hours or days, if the log is longer.
@@ -266,18 +228,19 @@ def signals_figure(data: Identified) -> Figure:
         steps.append({'step': 'hour', 'count': 6, 'label': 'last 6 h', 'stepmode': 'backward'})
     if days > 2.0:
         steps.append({'step': 'day', 'count': 1, 'label': 'last day', 'stepmode': 'backward'})
-    across = time_axis(anchor='y2')
+    across = plot.time_axis(anchor='y2')
     if steps:
         across['rangeselector'] = {
             'buttons': [*steps, {'step': 'all', 'label': 'all'}], 'x': 1, 'xanchor': 'right',
-            'y': -0.16, 'yanchor': 'top', 'bgcolor': token('panel'), 'activecolor': token('rule'),
-            'bordercolor': token('rule'), 'borderwidth': 1, 'font': {'color': token('ink')},
+            'y': -0.16, 'yanchor': 'top', 'bgcolor': plot.token('panel'),
+            'activecolor': plot.token('rule'), 'bordercolor': plot.token('rule'),
+            'borderwidth': 1, 'font': {'color': plot.token('ink')},
         }  # fmt: skip
     layout = {
         'xaxis': across,
         'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if steps else 46},
-        'yaxis': axis(f'u ({unit})', domain=[0.54, 1.0]),
-        'yaxis2': axis('power (MW)', domain=[0.0, 0.48]),
+        'yaxis': plot.axis(f'u ({unit})', domain=[0.54, 1.0]),
+        'yaxis2': plot.axis('power (MW)', domain=[0.0, 0.48]),
     }
     steady, slope = (len(data.rows_of(kind)) for kind, _, _ in _KINDS)
     samples = float((data.rows[:, 1] - data.rows[:, 0]).sum()) if len(data.rows) else 0.0
@@ -286,26 +249,25 @@ def signals_figure(data: Identified) -> Figure:
         f'<span class="key steady">Steady state</span> ({steady}): input and power hold. '
         f'<span class="key slope">Slope response</span> ({slope}): both move along a ramp, '
         'counted only after the turbine has caught up. Together they last '
-        f'{duration(samples * data.settings.real("sample_period"))}; everything else (grey) is '
-        'left out of the search for the pieces. '
+        f'{say.duration(samples * data.settings.real("sample_period"))}; everything else (grey) '
+        'is left out of the search for the pieces. '
         '<span class="mouse">Drag to zoom, double-click to return.</span>'
     )
     words = (
         f'Integrated input and generated power over time with '
-        f'{counted(steady, "steady-state segment")} and '
-        f'{counted(slope, "slope-response segment")} marked.'
+        f'{say.counted(steady, "steady-state segment")} and '
+        f'{say.counted(slope, "slope-response segment")} marked.'
     )
     traces = [*_panel(data, data.u, 'y', unit), *_panel(data, data.power, 'y2', 'MW')]
     return Figure('signals', caption, words, traces, layout, height=560)
 
 
 def _panel(data: Identified, values: FloatArray, up: str, unit: str) -> list[Spec]:
-    """Return the measured signal in grey and its special segments in colour."""
     time_ns = data.table.time_ns
     shown: Spec = {'yaxis': up, 'showlegend': up == 'y'}
-    start_ns, step_ns, ends = envelope(time_ns, values, _DRAWN_STRETCHES, data.period_ns)
-    measured = line(
-        None, rounded(ends), 'measured', 'data-soft', width=1, x0=start_ns / 1e6,
+    start_ns, step_ns, ends = plot.envelope(time_ns, values, _DRAWN_STRETCHES, data.period_ns)
+    measured = plot.line(
+        None, plot.rounded(ends), 'measured', 'data-soft', width=1, x0=start_ns / 1e6,
         dx=step_ns / 1e6, legendgroup='measured', **shown,
     )  # fmt: skip
     del measured['x']
@@ -313,9 +275,9 @@ def _panel(data: Identified, values: FloatArray, up: str, unit: str) -> list[Spe
     for kind, name, colour in _KINDS:
         times, means = segment_path(time_ns, values, data.rows_of(kind), _SEGMENT_POINTS)
         hover = f'{DAY_HOUR}%{{y:.4~g}} {unit}<extra>{name}</extra>'
-        traces.append(line(
-            packed(times), rounded(means), name, colour, hover, width=2.2, legendgroup=name,
-            **shown,
+        traces.append(plot.line(
+            plot.packed(times), plot.rounded(means), name, colour, hover, width=2.2,
+            legendgroup=name, **shown,
         ))  # fmt: skip
     return traces
 

@@ -17,44 +17,13 @@ from valveflow_ros.diagnosis.result import NAMED, NOTHING, Diagnosis
 from valveflow_ros.diagnosis.signature import Answer, ResidualMap, Signature
 from valveflow_ros.errors import listed
 from valveflow_ros.records import FloatArray
-from valveflow_ros.report.figure import (
-    DAY_HOUR,
-    Figure,
-    Spec,
-    area,
-    axis,
-    line,
-    moments,
-    points,
-    rounded,
-    time_axis,
-    token,
-)
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
+from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
 from valveflow_ros.report.history import History, history_sections
-from valveflow_ros.report.page import (
-    Page,
-    Section,
-    bullets,
-    foot,
-    notice,
-    paragraph,
-    table,
-    text,
-    where,
-)
-from valveflow_ros.report.words import (
-    UNKNOWN,
-    counted,
-    duration,
-    floor_words,
-    input_unit,
-    input_unit_plain,
-    interval,
-    level,
-    percent,
-    period,
-    plain,
-)
+from valveflow_ros.report.page import Page, Section
+from valveflow_ros.report.words import UNKNOWN
 
 _HOW = (
     'Means of bins with equally many minutes. A correct model stays in the band, here and '
@@ -91,11 +60,11 @@ def diagnosis_page(data: Diagnosed) -> Page:
         _answer(data, ranked), _wrong(data, ranked), _why(data), _model(data), _proof(data),
         *history_sections(data.history),
     ]  # fmt: skip
-    end_of_page = foot(
+    end_of_page = html.foot(
         'The same numbers, unrounded, stand in diagnosis.json and extended_model.json beside '
         'this page.'
     )
-    lead = where(data.source, period(data.start_ns, data.end_ns))
+    lead = html.where(data.source, say.period(data.start_ns, data.end_ns))
     return Page(title, lead, sections, end_of_page, 'diagnose')
 
 
@@ -105,127 +74,121 @@ def _drifts(d: Diagnosis) -> bool:
 
 
 def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
-    """Return the verdict with its uncertainty, its effect, and the most informative figure."""
-    d = data.diagnosis
-    said = text(d.sentence)
+    d, said = data.diagnosis, html.text(data.diagnosis.sentence)
     good = d.verdict == NOTHING and not _drifts(d)
-    parts: list[str | Figure] = [paragraph(said, 'good') if good else notice(said)]
-    for c in d.causes:
-        if c.not_told_apart:
-            names = text(listed((c.name, *c.not_told_apart)))
-            parts.append(notice(f'What would tell {names} apart: {text(c.experiment)}'))
-    for c in d.causes:
-        if c.to_do:
-            known = f': {text(c.meaning)}' if c.meaning else '.'
-            parts.append(paragraph(
-                f'<b>{text(c.name)}</b>{known} <b>What to do:</b> {text(c.to_do)}'
-            ))  # fmt: skip
-    parts.append(paragraph(
-        'On held-out data, the simulation differs from the measured '
-        f'power by {level(d.rmse_simulation, 2)} MW, the extended model by '
-        f'{level(d.rmse_extended, 2)} MW; {floor_words(d.disturbance is not None)} about '
-        f'{level(d.rmse_noise_floor, 2)} MW.'
-    ))  # fmt: skip
-    if ranked:
-        parts.append(signature_figure(ranked[0], data, _HOW))
-    return Section('The answer', parts)
+    apart = (
+        f'What would tell {html.text(listed((c.name, *c.not_told_apart)))} apart: '
+        f'{html.text(c.experiment)}'
+        for c in d.causes
+        if c.not_told_apart
+    )
+    advice = (
+        f'<b>{html.text(c.name)}</b>{f": {html.text(c.meaning)}" if c.meaning else "."} '
+        f'<b>What to do:</b> {html.text(c.to_do)}'
+        for c in d.causes
+        if c.to_do
+    )
+    proof = (
+        'On held-out data, the simulation differs from the measured power by '
+        f'{say.level(d.rmse_simulation, 2)} MW, the extended model by '
+        f'{say.level(d.rmse_extended, 2)} MW; {say.floor_words(d.disturbance is not None)} about '
+        f'{say.level(d.rmse_noise_floor, 2)} MW.'
+    )
+    return html.section(
+        'The answer', html.paragraph(said, 'good') if good else html.notice(said),
+        *map(html.notice, apart), *map(html.paragraph, (*advice, proof)),
+        signature_figure(ranked[0], data, _HOW) if ranked else None,
+    )  # fmt: skip
 
 
 def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     rows = [
-        [text(_variable(s.variable, data.exponent).removeprefix('the ')),
-         *(percent(share) for share in (s.share_before, s.share_after, s.share_chance))]
+        [html.text(_variable(s.variable, data.exponent).removeprefix('the ')),
+         *(say.percent(share) for share in (s.share_before, s.share_after, s.share_chance))]
         for s in ranked
     ]  # fmt: skip
-    parts: list[str | Figure] = [
-        paragraph(
+    return html.section(
+        '1. What is wrong',
+        html.paragraph(
             'The simulation (curve and regional dynamics) was run on the measured opening and '
             'pressure. How much of the difference to the measured power depends on each variable:'
         ),
-        table(['variable', 'simulation', 'extended model', 'by chance (99 %)'], rows),
+        html.table(['variable', 'simulation', 'extended model', 'by chance (99 %)'], rows),
         *(signature_figure(s, data) for s in ranked[1:]),
-    ]
-    if data.answers:
-        parts.append(answer_figure(data.answers))
-    parts += [map_figure(m, data) for m in data.maps if m.shown_before or m.shown_after]
-    return Section('1. What is wrong', parts)
+        answer_figure(data.answers) if data.answers else None,
+        *(map_figure(m, data) for m in data.maps if m.shown_before or m.shown_after),
+    )
 
 
 def _why(data: Diagnosed) -> Section:
     d = data.diagnosis
-    parts = [paragraph(text(c.sentence)) for c in d.causes] or [paragraph(text(d.sentence))]
+    parts = [html.paragraph(html.text(c.sentence)) for c in d.causes or (d,)]
     for c in d.causes:
         if c.switches_s:
             spans = times_in_effect(c.switches_s, data.start_ns, data.end_ns)
-            parts.append(paragraph(f'{text(c.name)} was in effect: {text(spans)}.'))
+            parts.append(html.paragraph(f'{html.text(c.name)} was in effect: {html.text(spans)}.'))
         if c.not_told_apart:
-            parts.append(notice(
-                f'{text(c.name)} cannot be told from {text(", ".join(c.not_told_apart))} '
-                f'with these data. What would tell them apart: {text(c.experiment)}'
+            parts.append(html.notice(
+                f'{html.text(c.name)} cannot be told from '
+                f'{html.text(", ".join(c.not_told_apart))} with these data. What would tell '
+                f'them apart: {html.text(c.experiment)}'
             ))  # fmt: skip
-    if d.unexplained_by:
-        parts.append(notice(f'Unexplained: depends on {text(" and ".join(d.unexplained_by))}.'))
-    if d.disturbance:
-        parts.append(paragraph(text(d.disturbance.sentence)))
-    if d.rejected:
-        said = 'Other causes, and why they are not named:'
-        parts.append(paragraph(said) + bullets(
-            f'<b>{text(n)}</b>: {text(reason)}' for n, reason in d.rejected
-        ))  # fmt: skip
-    return Section('2. Why', [*parts, *(paragraph(text(note)) for note in d.notes)])
+    rest = html.text(' and '.join(d.unexplained_by))
+    others = (f'<b>{html.text(name)}</b>: {html.text(reason)}' for name, reason in d.rejected)
+    return html.section(
+        '2. Why', *parts,
+        html.notice(f'Unexplained: depends on {rest}.') if rest else None,
+        html.paragraph(html.text(d.disturbance.sentence)) if d.disturbance else None,
+        html.paragraph('Other causes, and why they are not named:') + html.bullets(others)
+        if d.rejected else None,
+        *(html.paragraph(html.text(note)) for note in d.notes),
+    )  # fmt: skip
 
 
 def _model(data: Diagnosed) -> Section:
     d = data.diagnosis
-    names = f', and {", ".join(text(n) for n in d.final.names)}.' if d.final.names else '.'
-    parts: list[str | Figure] = [paragraph(
-        f'A curve of {counted(d.final.base.pieces, "piece")}, '
-        f'{counted(d.final.base.regions, "region")} of dynamics{names}'
-    )]  # fmt: skip
+    names = f', and {", ".join(html.text(n) for n in d.final.names)}.' if d.final.names else '.'
+    words = (
+        f'A curve of {say.counted(d.final.base.pieces, "piece")}, '
+        f'{say.counted(d.final.base.regions, "region")} of dynamics{names}'
+    )
     rows = [
-        [text(c.name), text(key), *(text(cell) for cell in cells(e, data.exponent))]
+        [html.text(c.name), html.text(key), *(html.text(cell) for cell in cells(e, data.exponent))]
         for c in d.causes
         for key, e in c.parameters.items()
     ]
-    if rows:
-        head = ['cause', 'parameter', 'value', '95 % interval']
-        parts.append(table(head, rows, sentences=True))
-    return Section('3. The extended model', parts)
+    head = ['cause', 'parameter', 'value', '95 % interval']
+    values = html.table(head, rows, sentences=True) if rows else ''
+    return html.section('3. The extended model', html.paragraph(words), values)
 
 
 def _proof(data: Diagnosed) -> Section:
     d = data.diagnosis
-    rows = [
-        ['simulation', level(d.rmse_simulation, 3)],
-        ['extended model', level(d.rmse_extended, 3)],
-        [f'{floor_words(d.disturbance is not None)} (estimate)', level(d.rmse_noise_floor, 3)],
-    ]
-    parts: list[str | Figure] = [
-        paragraph(
+    errors = [
+        ['simulation', say.level(d.rmse_simulation, 3)],
+        ['extended model', say.level(d.rmse_extended, 3)],
+        [f'{say.floor_words(d.disturbance is not None)} (estimate)',
+         say.level(d.rmse_noise_floor, 3)],
+    ]  # fmt: skip
+    gains = [
+        [html.text(c.name), say.level(c.gain.rmse_before, 3), say.level(c.gain.rmse_after, 3),
+         say.percent(c.gain.reduction), say.plain(c.gain.p_value, 2)]
+        for c in d.causes if math.isfinite(c.gain.p_value)
+    ]  # fmt: skip
+    told = html.paragraph(
+        'What each cause gains there; p is the probability of such a gain by chance, '
+        'corrected for the number of causes tried:'
+    ) + html.table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], gains)
+    return html.section(
+        '4. Check on held-out data',
+        html.paragraph(
             'Every fifth block of the record was held out: nothing was fitted to it, and it was '
             'used once. Root mean square difference there, of means over '
-            f'{duration(d.mean_s)}:'
+            f'{say.duration(d.mean_s)}:'
         ),
-        table(['model', 'MW'], rows),
-    ]
-    gains = [(c.name, c.gain) for c in d.causes if math.isfinite(c.gain.p_value)]
-    if gains:
-        rows = [
-            [text(name), level(g.rmse_before, 3), level(g.rmse_after, 3),
-             percent(g.reduction), plain(g.p_value, 2)]
-            for name, g in gains
-        ]  # fmt: skip
-        parts += [
-            paragraph(
-                'What each cause gains there; p is the probability of such a gain by chance, '
-                'corrected for the '
-                'number of causes tried:'
-            ),
-            table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], rows),
-        ]
-    if d.segments:
-        parts.append(segments_figure(d.segments))
-    return Section('4. Check on held-out data', parts)
+        html.table(['model', 'MW'], errors), told if gains else None,
+        segments_figure(d.segments) if d.segments else None,
+    )  # fmt: skip
 
 
 # Presentation of a diagnosis: names of variables, parameters, times as dates.
@@ -268,7 +231,6 @@ _MOST_SPANS = 20
 
 
 def _variable(name: str, exponent: float) -> str:
-    """Return the name of a variable in a sentence; the exponent is that of u."""
     return _of_opening(_VARIABLES[name][0], exponent) if name in _VARIABLES else name
 
 
@@ -284,7 +246,7 @@ def axis_titles(name: str, exponent: float) -> dict[str, str]:
     if name not in _VARIABLES:
         return {'text': name}
     _, long, short, _ = _VARIABLES[name]
-    long = _of_opening(long, exponent).replace('{unit}', input_unit(exponent))
+    long = _of_opening(long, exponent).replace('{unit}', say.input_unit(exponent))
     return {'text': long, 'short': short} if short else {'text': long}
 
 
@@ -298,9 +260,9 @@ def cells(estimate: Estimate, exponent: float) -> tuple[str, str]:
     if estimate.origin_ns is not None:
         at, between = dates(estimate)
         return at, between or UNKNOWN
-    unit = estimate.unit.replace(input_unit_plain(math.nan), input_unit_plain(exponent))
-    value = f'{plain(estimate.value)} {unit}'.strip()
-    return value, interval(estimate.low, estimate.high)
+    unit = estimate.unit.replace(say.input_unit_plain(math.nan), say.input_unit_plain(exponent))
+    value = f'{say.plain(estimate.value)} {unit}'.strip()
+    return value, say.interval(estimate.low, estimate.high)
 
 
 def times_in_effect(switches_s: Sequence[float], start_ns: int, end_ns: int) -> str:
@@ -326,16 +288,14 @@ _BOTH = (('simulation', 'raw', 'dash'), ('extended model', 'curve', 'solid'))
 
 
 def _moments(start_ns: int, time_s: FloatArray) -> list[float | None]:
-    """Return times since the first row in the format of a date axis."""
-    return moments(start_ns / 1e6 + 1e3 * np.asarray(time_s))
+    return plot.moments(start_ns / 1e6 + 1e3 * np.asarray(time_s))
 
 
 def _marked(
     x: list[float | None], y: FloatArray, name: str, colour: str, dash: str, hover: str
 ) -> Spec:
-    return line(
-        x, rounded(y, 4), name, colour, hover, dash=dash, mode='lines+markers', marker={'size': 5}
-    )
+    look: Spec = {'dash': dash, 'mode': 'lines+markers', 'marker': {'size': 5}}
+    return plot.line(x, plot.rounded(y, 4), name, colour, hover, **look)
 
 
 def signature_figure(s: Signature, data: Diagnosed, how: str = '') -> Figure:
@@ -344,31 +304,31 @@ def signature_figure(s: Signature, data: Diagnosed, how: str = '') -> Figure:
     ``how`` explains how to read such a figure.
     """
     titles = axis_titles(s.variable, data.exponent)
-    across, x = axis(titles), rounded(s.middle, 6)
+    across, x = plot.axis(titles), plot.rounded(s.middle, 6)
     hover = f'{titles["text"]}: %{{x:.4~g}}<br>%{{y:+.2f}} MW'
     if s.variable == 'time':
-        across, x, hover = time_axis(), _moments(data.start_ns, s.middle), (
+        across, x, hover = plot.time_axis(), _moments(data.start_ns, s.middle), (
             f'{DAY_HOUR}%{{y:+.2f}} MW'
         )  # fmt: skip
     elif s.variable == 'time of day':
-        x = rounded(s.middle / 3600.0, 6)
-    chance = rounded(np.concatenate([s.chance, -s.chance[::-1]]), 4)
-    traces = [area([*x, *x[::-1]], chance, 'by chance (99 %)',
-                   line={'width': 0, 'color': token('band')})]  # fmt: skip
+        x = plot.rounded(s.middle / 3600.0, 6)
+    chance = plot.rounded(np.concatenate([s.chance, -s.chance[::-1]]), 4)
+    traces = [plot.area([*x, *x[::-1]], chance, 'by chance (99 %)',
+                   line={'width': 0, 'color': plot.token('band')})]  # fmt: skip
     traces += [
         _marked(x, values, *look, hover)
         for values, look in zip((s.before, s.after), _BOTH, strict=True)
     ]
-    ends = [plain(float(v), 2) for v in (s.before.min(), s.before.max(), s.after.min(),
+    ends = [say.plain(float(v), 2) for v in (s.before.min(), s.before.max(), s.after.min(),
                                          s.after.max())]  # fmt: skip
     variable = _variable(s.variable, data.exponent)
     return Figure(
         f'residual-{s.variable.replace(" ", "-")}',
-        f'<b>Measured minus simulated power against {text(variable)}.</b> '
+        f'<b>Measured minus simulated power against {html.text(variable)}.</b> '
         f'{points_to(s.variable)} {how}',
         f'Mean residual against {variable}, from {ends[0]} to {ends[1]} MW before '
         f'and {ends[2]} to {ends[3]} MW after.',
-        traces, {'xaxis': across, 'yaxis': axis('mean residual (MW)')}, height=300,
+        traces, {'xaxis': across, 'yaxis': plot.axis('mean residual (MW)')}, height=300,
     )  # fmt: skip
 
 
@@ -379,7 +339,7 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
         way = 'opening' if a.up else 'closing'
         for (name, _, dash), values in zip(_BOTH, (a.before, a.after), strict=True):
             traces.append(_marked(
-                rounded(a.time_s, 6), values, f'{name}, {way}', 'steady' if a.up else 'slope',
+                plot.rounded(a.time_s, 6), values, f'{name}, {way}', 'steady' if a.up else 'slope',
                 dash, '%{x:.0f} s<br>%{y:+.3~g} MW',
             ))  # fmt: skip
     chance = max(a.chance for a in answers)
@@ -388,9 +348,9 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
         'fast-moves',
         f'<b>Mean residual around fast moves of the valve</b> ({moves}). Only this picture shows '
         'whether the unit answers late or early. By chance a point lies within '
-        f'±{plain(chance, 2)} MW.',
+        f'±{say.plain(chance, 2)} MW.',
         'Mean residual from a minute before to five minutes after fast moves.', traces,
-        {'xaxis': axis('time after the move (s)'), 'yaxis': axis('mean residual (MW)')},
+        {'xaxis': plot.axis('time after the move (s)'), 'yaxis': plot.axis('mean residual (MW)')},
         height=340,
     )  # fmt: skip
 
@@ -398,10 +358,10 @@ def answer_figure(answers: Sequence[Answer]) -> Figure:
 def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
     """Return the error in every special segment of the sealed (test) blocks, for both models."""
     better = sum(s.rmse_after < s.rmse_before for s in segments)
-    at = moments([s.start_ns / 1e6 for s in segments])
+    at = plot.moments([s.start_ns / 1e6 for s in segments])
     errors = [s.rmse_before for s in segments], [s.rmse_after for s in segments]
     traces = [
-        points(at, rounded(values, 4), name, colour, f'{DAY_HOUR}%{{y:.2f}} MW',
+        plot.points(at, plot.rounded(values, 4), name, colour, f'{DAY_HOUR}%{{y:.2f}} MW',
                marker={'symbol': sign})
         for values, (name, colour, _), sign in zip(
             errors, _BOTH, ('circle-open', 'circle'), strict=True
@@ -411,14 +371,14 @@ def segments_figure(segments: Sequence[SegmentGain]) -> Figure:
         'segments',
         f'<b>Special segments in the held-out blocks.</b> {better} of {len(segments)} are '
         'predicted better by the extended model.',
-        f'{counted(len(segments), "segment")}, {better} of them predicted better.', traces,
-        {'xaxis': time_axis(), 'yaxis': axis('RMSE (MW)')}, height=340,
+        f'{say.counted(len(segments), "segment")}, {better} of them predicted better.', traces,
+        {'xaxis': plot.time_axis(), 'yaxis': plot.axis('RMSE (MW)')}, height=340,
     )  # fmt: skip
 
 
 def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
     """Return the errors of the simulation and of the extended model over two variables."""
-    across, over = rounded(m.across_edges, 6), Spec()
+    across, over = plot.rounded(m.across_edges, 6), Spec()
     below = axis_titles(m.across, data.exponent)['text']
     if m.across == 'time':
         across, below = _moments(data.start_ns, m.across_edges), 'day of the month (UTC)'
@@ -429,8 +389,8 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
     )
     traces: list[Spec] = [
         {
-            'type': 'heatmap', 'name': name, 'x': across, 'y': rounded(m.up_edges, 4),
-            'z': [rounded(row, 3) for row in residual], 'zmin': -largest, 'zmax': largest,
+            'type': 'heatmap', 'name': name, 'x': across, 'y': plot.rounded(m.up_edges, 4),
+            'z': [plot.rounded(row, 3) for row in residual], 'zmin': -largest, 'zmax': largest,
             'zmid': 0.0, 'colorscale': 'RdBu', 'showscale': bool(side),
             'colorbar': {'title': {'text': 'MW'}}, 'xaxis': f'x{side}', 'yaxis': f'y{side}',
             'hovertemplate': '%{z} MW<extra></extra>',
@@ -442,7 +402,7 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
     layout = {
         'xaxis': {**over, 'domain': [0.0, 0.46]},
         'xaxis2': {**over, 'domain': [0.54, 1.0], 'anchor': 'y2'},
-        'yaxis': axis(axis_titles(m.up, data.exponent)['text']),
+        'yaxis': plot.axis(axis_titles(m.up, data.exponent)['text']),
         # One title for both axes: two titles side by side do not fit on a phone.
         'annotations': [
             {'text': below, 'showarrow': False, 'xref': 'paper', 'x': 0.5, 'xanchor': 'center',
@@ -454,11 +414,10 @@ def map_figure(m: ResidualMap, data: Diagnosed) -> Figure:
     names = [_variable(name, data.exponent) for name in (m.across, m.up)]
     return Figure(
         f'map-{m.across.replace(" ", "-")}',
-        f'<b>Residual over {text(names[0])} and {text(names[1])}</b>, '
-        'simulation left, extended model right. Only cells outside the 99 % band of random noise '
-        'are filled: '
+        f'<b>Residual over {html.text(names[0])} and {html.text(names[1])}</b>, simulation left, '
+        'extended model right. Only cells outside the 99 % band of random noise are filled: '
         f'{m.shown_before} of {m.cells} for the simulation, {m.shown_after} for the extended '
-        f'model; chance alone fills about {plain(0.01 * m.cells, 1)}.',
+        f'model; chance alone fills about {say.plain(0.01 * m.cells, 1)}.',
         f'{m.shown_before} of {m.cells} cells are outside it before, {m.shown_after} after.',
         traces, layout, height=380,
     )  # fmt: skip

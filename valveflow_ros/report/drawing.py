@@ -92,7 +92,6 @@ def figure_files(figure: Figure) -> dict[str, bytes]:
 
 
 def _painted(value: Any, colours: Mapping[str, str]) -> Any:
-    """Return the plotly data with colours in the format of matplotlib."""
     if isinstance(value, dict):
         return {k: v if k in _NUMBERS else _painted(v, colours) for k, v in value.items()}
     if isinstance(value, list):
@@ -107,7 +106,6 @@ def _painted(value: Any, colours: Mapping[str, str]) -> Any:
 
 
 def _fill(sheet: Any, figure: Figure, grid_colour: Any) -> None:
-    """Draw a figure with resolved colours: one pane per pair of axes."""
     columns, column_of = _places(figure.layout, 'x')
     rows, row_of = _places(figure.layout, 'y')
     # The pane with the highest domain is in the first row.
@@ -154,7 +152,6 @@ def _places(layout: Spec, letter: str) -> tuple[list[tuple[float, float]], dict[
 
 
 def _prepare(pane: Any, figure: Figure, trace: Spec, grid_colour: Any) -> None:
-    """Set titles and axis types of a pane."""
     from matplotlib import dates, ticker
 
     across, up = axis_of(figure, trace, 'x'), axis_of(figure, trace, 'y')
@@ -188,7 +185,6 @@ def _words(axis: Spec) -> str:
 
 
 def _marks(pane: Any, layout: Spec, x: str, y: str) -> None:
-    """Draw the shapes of a pane."""
     unit = _DAY_MS if is_date(layout.get(f'xaxis{x[1:]}', {})) else 1.0
     for shape in layout.get('shapes', []):
         across, up = shape.get('xref', 'x'), shape.get('yref', 'y')
@@ -300,7 +296,6 @@ def _edges(places: FloatArray, count: int) -> FloatArray:
 
 
 def _bars(pane: Any, trace: Spec, x: FloatArray, label: str) -> None:
-    """Draw bars on top of existing ones, stacked as on the page."""
     y, colour = numbers(trace, 'y'), trace['marker']['color']
     below = getattr(pane, 'stacked', np.zeros_like(y))
     width = float(x[1] - x[0]) if len(x) > 1 else 1.0

@@ -32,30 +32,14 @@ DAY_HOUR = '%{x|%d %b %H:%M}<br>'  # the time in the first line of a hover text
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure of the page.
+    """One figure of the page."""
 
-    Attributes
-    ----------
-    name : str
-        Letters and dashes; the id of the HTML element.
-    caption : str
-        HTML text that says what the figure shows.
-    description : str
-        Plain text description for screen readers.
-    traces : list
-        plotly traces.
-    layout : dict
-        Differences from the base layout of the page.
-    height : int
-        Height in pixels.
-    """
-
-    name: str
-    caption: str
-    description: str
-    traces: list[Spec]
-    layout: Spec = field(default_factory=dict)
-    height: int = 420
+    name: str  # letters and dashes; the id of the HTML element
+    caption: str  # HTML that says what the figure shows
+    description: str  # plain text for screen readers
+    traces: list[Spec]  # of plotly
+    layout: Spec = field(default_factory=dict)  # differences from the base layout of the page
+    height: int = 420  # pixels
 
     def to_json(self) -> str:
         """Return the figure for the script of the page; safe inside a script element."""
@@ -65,7 +49,6 @@ class Figure:
 
 
 def _clean(value: Any) -> Any:
-    """Convert numpy scalars to Python's, and values that are not finite to null."""
     if isinstance(value, Mapping):
         return {str(k): _clean(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -157,15 +140,9 @@ def envelope(
 ) -> tuple[int, float, FloatArray]:
     """Reduce a signal to at most ``2 * stretches`` points, keeping every peak.
 
-    A short signal keeps each of its values at its own grid position.
-
-    Returns
-    -------
-    start_ns, step_ns : int, float
-        Time of the first point and step between points.
-    values : float64 (2 k,)
-        Lowest and highest value of each interval in the order in which they occur; NaN if
-        nothing was measured.
+    A short signal keeps each of its values at its own grid position. Returns the time of the first
+    point, the step, and the lowest and highest value of each interval in the order in which they
+    occur, float64 (2 k,), NaN if nothing was measured.
     """
     if not len(time_ns):
         return 0, 1.0, np.empty(0)
@@ -344,7 +321,6 @@ def _cell(value: Any, date: bool = False) -> str:
 
 
 def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
-    """Yield x, y, value, and the ends of the error bar of each point."""
     x, y = column(trace, 'x'), column(trace, 'y')
     if trace['type'] == 'heatmap':
         across = _centres(x, len(trace['z'][0]))
@@ -362,7 +338,6 @@ def _points(trace: Spec) -> Iterator[tuple[Any, Any, Any, Any, Any]]:
 
 
 def _centres(places: list[Any], count: int) -> list[Any]:
-    """Return the centres of cells given by their edges."""
     if len(places) == count:
         return places
     return [0.5 * (a + b) for a, b in pairwise(places)]

@@ -34,13 +34,11 @@ def must_compile_to_fit() -> bool:
 
 
 def _cold_share() -> float:
-    """Return the fraction of the loaded functions of the engine that is not in the cache."""
     known = [cold for dispatcher in _compiled() if (cold := _is_cold(dispatcher)) is not None]
     return sum(known) / len(known) if known else 0.0
 
 
 def _compiled() -> Iterator[Any]:
-    """Yield the compiled functions of the loaded modules of the engine."""
     for name, module in list(sys.modules.items()):
         if name.startswith(_ENGINE):
             yield from (

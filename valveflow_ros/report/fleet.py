@@ -11,10 +11,13 @@ from urllib.parse import quote
 
 import numpy as np
 
-from valveflow_ros.report.figure import Figure, moments, rounded, time_axis
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
+from valveflow_ros.report.figure import Figure
 from valveflow_ros.report.history import CurveMoment, History, curve_history_figure
-from valveflow_ros.report.page import Page, Section, bullets, foot, paragraph, table, text
-from valveflow_ros.report.words import VERDICT_WORDS, counted, moment, signed
+from valveflow_ros.report.page import Page, Section
+from valveflow_ros.report.words import VERDICT_WORDS
 
 UNITS, REPORT = 'units', 'report.html'
 _VERBS = ('identify', 'diagnose', 'monitor')
@@ -26,56 +29,27 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class UnitStory:
-    """The summary of a unit for the overview.
-
-    Attributes
-    ----------
-    unit : str
-    logs, failed : int
-        Number of logs, and number of logs without a result.
-    output_unit : str
-    moved : bool
-        The last curve differs significantly from the first one.
-    change_mw : float or None
-        Mean difference over the common range of both; None if there are not two curves.
-    piece : str
-        The piece with the largest change, in words.
-    since : str
-        Begin of the change, in words.
-    causes : tuple of str
-        Names of the causes since the change, in the order found.
-    alarms : tuple of str
-        Names of the alarms that stand at the end of the last log.
-    changes : tuple of (int, float)
-        Begin of each log (ns) and its change in MW.
-    failures : tuple of (str, str)
-        Log and sentence, including results that are incomplete.
-    history : History
-        The curves.
-    """
+    """The summary of a unit for the overview."""
 
     unit: str
     logs: int
-    failed: int
+    failed: int  # logs without a result
     output_unit: str
-    moved: bool
-    change_mw: float | None
-    piece: str
-    since: str
-    causes: tuple[str, ...]
-    alarms: tuple[str, ...]
-    changes: tuple[tuple[int, float], ...]
-    failures: tuple[tuple[str, str], ...]
-    history: History
+    moved: bool  # the last curve differs significantly from the first one
+    change_mw: float | None  # mean over the range of both; None if there are not two curves
+    piece: str  # that with the largest change, in words
+    since: str  # the begin of the change, in words
+    causes: tuple[str, ...]  # named since the change, in the order found
+    alarms: tuple[str, ...]  # that stand at the end of the last log
+    changes: tuple[tuple[int, float], ...]  # begin of each log (ns) and its change in MW
+    failures: tuple[tuple[str, str], ...]  # log and sentence, also of incomplete results
+    history: History  # the curves
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary as a dict of plain values."""
         names = ('unit', 'logs', 'failed', 'output_unit', 'moved', 'change_mw', 'piece', 'since')
-        return {
-            **{name: getattr(self, name) for name in names},
-            'causes': list(self.causes),
-            'alarms': list(self.alarms),
-        }
+        plain = {name: getattr(self, name) for name in names}
+        return plain | {'causes': list(self.causes), 'alarms': list(self.alarms)}
 
 
 def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
@@ -85,7 +59,7 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
     # The change began in the first of the last consecutive logs that all show it.
     changed: list[Row] = []
     for row in reversed(curves):
-        if not row.get('change_moved') or not _same_side(row, last):
+        if not row.get('change_moved') or (row['change_mw'] < 0.0) != (last['change_mw'] < 0.0):
             break
         changed.insert(0, row)
     named = dict.fromkeys(c['name'] for row in changed for c in row.get('causes') or ())
@@ -107,10 +81,6 @@ def story_of(unit: str, rows: Sequence[Row]) -> UnitStory:
     )  # fmt: skip
 
 
-def _same_side(row: Row, last: Row) -> bool:
-    return bool((row['change_mw'] < 0.0) == (last['change_mw'] < 0.0))
-
-
 def _since(row: Row) -> str:
     """Return when the change began: from the diagnosis, the segments, or the start of the log.
 
@@ -126,10 +96,10 @@ def _since(row: Row) -> str:
     for of, name in dated:
         if of.get(name):
             ends = [of.get(f'{name}_{end}') for end in ('low', 'high')]
-            between = ' to '.join(moment(e)[:16] for e in ends if e)
-            told = f'{moment(of[name])[:16]} UTC'
+            between = ' to '.join(say.moment(e)[:16] for e in ends if e)
+            told = f'{say.moment(of[name])[:16]} UTC'
             return f'{told} (95 %: {between})' if all(ends) else told
-    return f'before {moment(row["start"])[:16]} UTC'
+    return f'before {say.moment(row["start"])[:16]} UTC'
 
 
 def _history(curves: Sequence[Row]) -> History:
@@ -147,30 +117,25 @@ def _history(curves: Sequence[Row]) -> History:
 
 
 def _link(words: str, *parts: str) -> str:
-    """Return a link to a file next to the page; ``words`` are HTML."""
     return f'<a href="{"/".join(quote(p, safe="") for p in parts)}">{words}</a>'
-
-
-def _by_loss(story: UnitStory) -> tuple[bool, float, str]:
-    return not story.moved, story.change_mw or 0.0, story.unit
 
 
 def fleet_page(stories: Sequence[UnitStory]) -> Page:
     """Return the overview of all units."""
-    ordered = sorted(stories, key=_by_loss)
+    ordered = sorted(stories, key=lambda s: (not s.moved, s.change_mw or 0.0, s.unit))
     moved = [s for s in ordered if s.moved]
     less = [s for s in moved if (s.change_mw or 0.0) < 0.0]
     logs, failed = sum(s.logs for s in stories), sum(s.failed for s in stories)
-    told = f'{counted(len(stories), "unit")}, {counted(logs, "log")}'
-    told += f', {counted(failed, "log")} without a result.' if failed else '.'
+    told = f'{say.counted(len(stories), "unit")}, {say.counted(logs, "log")}'
+    told += f', {say.counted(failed, "log")} without a result.' if failed else '.'
     alone = sum(s.change_mw is None for s in stories)
     answer = (
-        f'{counted(len(less), "unit gives", "units give")} less power than in the first log, '
-        f'{counted(len(moved) - len(less), "unit gives", "units give")} more; '
-        f'{counted(len(stories) - len(moved) - alone, "shows", "show")} no change'
+        f'{say.counted(len(less), "unit gives", "units give")} less power than in the first log, '
+        f'{say.counted(len(moved) - len(less), "unit gives", "units give")} more; '
+        f'{say.counted(len(stories) - len(moved) - alone, "shows", "show")} no change'
     )
     answer += f', and {alone} cannot be judged yet, for want of a second curve.' if alone else '.'
-    sections = [Section('Which units lose power', [paragraph(answer), _units_table(ordered)])]
+    sections = [Section('Which units lose power', [html.paragraph(answer), _units_table(ordered)])]
     if any(len(s.changes) > 1 for s in stories):
         sections.append(Section('When they changed', [changes_figure(ordered)]))
     shown = [s for s in moved if len(s.history.curves) > 1][:_HISTORIES]
@@ -178,30 +143,34 @@ def fleet_page(stories: Sequence[UnitStory]) -> Page:
         figure = curve_history_figure(story.history)
         sections.append(Section(f'The curves of {story.unit}', [
             replace(figure, name=f'history-{k + 1}'),
-            paragraph(_link('All logs and reports of this unit', UNITS, story.unit, REPORT)),
+            html.paragraph(_link('All logs and reports of this unit', UNITS, story.unit, REPORT)),
         ]))  # fmt: skip
-    troubles = [[text(s.unit), text(log), text(why)] for s in stories for log, why in s.failures]
+    troubles = [
+        [html.text(s.unit), html.text(log), html.text(why)]
+        for s in stories
+        for log, why in s.failures
+    ]
     if troubles:
         more = len(troubles) - _FAILURES
         sections.append(Section('What could not be done', [
-            table(['unit', 'log', 'why'], troubles[:_FAILURES], sentences=True),
-            paragraph(f'{more} more stand in fleet.parquet.') if more > 0 else '',
+            html.table(['unit', 'log', 'why'], troubles[:_FAILURES], sentences=True),
+            html.paragraph(f'{more} more stand in fleet.parquet.') if more > 0 else '',
         ]))  # fmt: skip
     return Page(
-        'The fleet', paragraph(told, 'where'), sections,
-        foot('One row a log stands in fleet.parquet beside this page.'), 'fleet',
+        'The fleet', html.where(told), sections,
+        html.foot('One row a log stands in fleet.parquet beside this page.'), 'fleet',
     )  # fmt: skip
 
 
 def _units_table(stories: Sequence[UnitStory]) -> str:
     rows = [
         [
-            _link(text(s.unit), UNITS, s.unit, REPORT),
-            'not known' if s.change_mw is None else f'{signed(s.change_mw)} {s.output_unit}',
-            text(s.piece) or ('not compared' if s.change_mw is None else 'no change seen'),
-            text(s.since) or '-',
-            (text(', '.join(s.causes)) or 'not named') if s.moved else '-',
-            text(', '.join(s.alarms)) or '-',
+            _link(html.text(s.unit), UNITS, s.unit, REPORT),
+            'not known' if s.change_mw is None else f'{say.signed(s.change_mw)} {s.output_unit}',
+            html.text(s.piece) or ('not compared' if s.change_mw is None else 'no change seen'),
+            html.text(s.since) or '-',
+            (html.text(', '.join(s.causes)) or 'not named') if s.moved else '-',
+            html.text(', '.join(s.alarms)) or '-',
             f'{s.logs - s.failed} of {s.logs}',
         ]
         for s in stories
@@ -209,7 +178,7 @@ def _units_table(stories: Sequence[UnitStory]) -> str:
     head = ['unit', 'change, mean', 'piece that changed most', 'since',
             'causes named since then (perhaps only a part)', 'alarms at the end',
             'logs done']  # fmt: skip
-    return table(head, rows, sentences=True)
+    return html.table(head, rows, sentences=True)
 
 
 def changes_figure(stories: Sequence[UnitStory]) -> Figure:
@@ -226,15 +195,15 @@ def changes_figure(stories: Sequence[UnitStory]) -> Figure:
     largest = max(float(np.nanmax(np.abs(z))), 1e-9)
     unit = shown[0].output_unit
     trace = {
-        'type': 'heatmap', 'name': 'change', 'x': moments(begin + step * np.arange(columns)),
-        'y': [text(s.unit) for s in shown], 'z': [rounded(row, 3) for row in z],
+        'type': 'heatmap', 'name': 'change', 'x': plot.moments(begin + step * np.arange(columns)),
+        'y': [html.text(s.unit) for s in shown], 'z': [plot.rounded(row, 3) for row in z],
         'zmin': -largest, 'zmax': largest, 'zmid': 0.0, 'colorscale': 'RdBu', 'ygap': 2,
         'reversescale': True,
         'colorbar': {'title': {'text': unit}},
         'hovertemplate': f'%{{y}}, %{{x|%d %b %Y}}<br>%{{z:+.2f}} {unit}<extra></extra>',
     }  # fmt: skip
     layout = {
-        'xaxis': time_axis(), 'yaxis': {'type': 'category', 'autorange': 'reversed'},
+        'xaxis': plot.time_axis(), 'yaxis': {'type': 'category', 'autorange': 'reversed'},
     }  # fmt: skip
     caption = (
         '<b>Red: less power than the first curve of the unit gave at the same openings and '
@@ -242,7 +211,7 @@ def changes_figure(stories: Sequence[UnitStory]) -> Figure:
         'end is a lasting change. Units are in the order of the table above. Where there is no '
         'colour there is no curve.'
     )
-    words = f'Change against the first curve of {counted(len(shown), "unit")} over time.'
+    words = f'Change against the first curve of {say.counted(len(shown), "unit")} over time.'
     height = 140 + _UNIT_PX * max(len(shown), 4)
     return Figure('changes', caption, words, [trace], layout, height=height)
 
@@ -250,29 +219,28 @@ def changes_figure(stories: Sequence[UnitStory]) -> Figure:
 def unit_page(unit: str, rows: Sequence[Row]) -> Page:
     """Return the page of one unit, with links to the reports of its logs."""
     story = story_of(unit, rows)
-    lead = paragraph(text(f'{counted(story.logs, "log")}, {story.failed} without a result.'),
-                     'where')  # fmt: skip
+    done = f'{say.counted(story.logs, "log")}, {story.failed} without a result.'
     answer = 'No change against the first curve is seen.'
     if story.change_mw is None:
         answer = 'There is no second curve yet to tell a change by.'
     if story.moved:
         named = f'Causes named: {", ".join(story.causes)}.' if story.causes else 'No cause named.'
         answer = f'{story.piece}, since {story.since}. {named}'
-    sections = [Section('Has it changed', [paragraph(text(answer))])]
+    sections = [Section('Has it changed', [html.paragraph(html.text(answer))])]
     if len(story.history.curves) > 1:
         sections[0].parts.append(curve_history_figure(story.history))
     head = ['log', 'from', 'against the log before', 'diagnosis', 'alarms', 'reports']
     sections.append(Section('Log by log', [
-        table(head, [_log_cells(row) for row in rows], sentences=True),
+        html.table(head, [_log_cells(row) for row in rows], sentences=True),
     ]))  # fmt: skip
     said = [
-        f'<b>{text(row["log"])}</b>: {text(c["sentence"])} {text(c["meaning"])}'
+        f'<b>{html.text(row["log"])}</b>: {html.text(c["sentence"])} {html.text(c["meaning"])}'
         for row in rows for c in row.get('causes') or ()
     ]  # fmt: skip
     if said:
-        sections.append(Section('Causes that were named', [bullets(said)]))
+        sections.append(Section('Causes that were named', [html.bullets(said)]))
     back = '<a href="../../fleet.html">All units</a>.'
-    return Page(f'Unit {unit}', lead, sections, foot(back), 'fleet')
+    return Page(f'Unit {unit}', html.where(done), sections, html.foot(back), 'fleet')
 
 
 def _log_cells(row: Row) -> list[str]:
@@ -288,13 +256,12 @@ def _log_cells(row: Row) -> list[str]:
     if row.get('shift_moved'):
         moved = _moved(row, 'shift')
     return [
-        text(row['log']), moment(row['start'])[:16] if row.get('start') else '-',
-        text(' '.join(row['sentences']) or moved), text(diagnosis), text(alarms) or '-',
-        ' '.join(links) or '-',
+        html.text(row['log']), say.moment(row['start'])[:16] if row.get('start') else '-',
+        html.text(' '.join(row['sentences']) or moved), html.text(diagnosis),
+        html.text(alarms) or '-', ' '.join(links) or '-',
     ]  # fmt: skip
 
 
 def _moved(row: Row, name: str) -> str:
-    """Return the largest change of a piece, in words."""
     low, high = row[f'{name}_u_from'], row[f'{name}_u_to']
-    return f'{signed(row[f"{name}_mw"])} {row["output_unit"]} at u {low:.0f} to {high:.0f}'
+    return f'{say.signed(row[f"{name}_mw"])} {row["output_unit"]} at u {low:.0f} to {high:.0f}'

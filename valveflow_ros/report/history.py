@@ -4,68 +4,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from valveflow_ros.monitoring.alarm_state import AlarmState
 from valveflow_ros.monitoring.alarms import CALM
 from valveflow_ros.records import FloatArray, IntArray
-from valveflow_ros.report.figure import (
-    DAY_HOUR,
-    Figure,
-    Spec,
-    axis,
-    envelope,
-    error_bars,
-    line,
-    moments,
-    points,
-    rounded,
-    stripe,
-    time_axis,
-    token,
-)
-from valveflow_ros.report.page import Section, folded, notice, paragraph, table, text
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
+from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
+from valveflow_ros.report.page import Section
 from valveflow_ros.report.terminal.board import decoded
 from valveflow_ros.report.terminal.frame import AlarmView, CurveView, DiagnosisView
-from valveflow_ros.report.words import (
-    counted,
-    decimals,
-    duration,
-    input_unit,
-    moment,
-    period,
-    plain,
-)
 
 
 @dataclass(frozen=True, slots=True)
 class CurveMoment:
-    """A curve, and the time of its publication.
-
-    Attributes
-    ----------
-    time_ns : int
-        Time of its publication.
-    model_id : str
-    exponent : float
-        Exponent of the pressure in u.
-    u, power_mw : float64 (J + 1,)
-        Ends of the pieces, and the power at them.
-    low, high : float64 (J - 1,)
-        95 % intervals of the inner ends; NaN if unknown.
-    rmse_mw : float
-    """
+    """A curve, and the time of its publication."""
 
     time_ns: int
     model_id: str
-    exponent: float
-    u: FloatArray
-    power_mw: FloatArray
-    low: FloatArray
+    exponent: float  # of the pressure in u
+    u: FloatArray  # (J + 1,) ends of the pieces
+    power_mw: FloatArray  # (J + 1,) at them
+    low: FloatArray  # (J - 1,) 95 % intervals of the inner ends; NaN if unknown
     high: FloatArray
     rmse_mw: float
 
@@ -91,32 +57,19 @@ class DiagnosisMoment:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """The messages of a monitor, each kind in order of time.
+    """The messages of a monitor, each kind in order of time."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        First and last time of the recording, in the time of the plant.
-    curves : tuple of CurveMoment
-        Each curve once, at its first publication.
-    alarms : tuple of AlarmMoment
-    diagnoses : tuple of DiagnosisMoment
-    notes : tuple of str
-        Sentences about what could not be read.
-    """
-
-    start_ns: int
+    start_ns: int  # of the recording, in the time of the plant
     end_ns: int
-    curves: tuple[CurveMoment, ...] = ()
+    curves: tuple[CurveMoment, ...] = ()  # each once, at its first publication
     alarms: tuple[AlarmMoment, ...] = ()
     diagnoses: tuple[DiagnosisMoment, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # about what could not be read
 
 
 Moment = CurveMoment | AlarmMoment | DiagnosisMoment
 # The alarm whose sentence may change without a change of its state.
 _SHIFT = 'curve_shift'
-Item = TypeVar('Item')
 
 
 def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
@@ -152,15 +105,9 @@ def history_of(
 ) -> History | None:
     """Return the history of the published messages; None if a log contains no monitor.
 
-    Parameters
-    ----------
-    told : iterable of CurveMoment, AlarmMoment, DiagnosisMoment
-        In any order. Latched messages are published repeatedly, and standing alarms again after a
-        restart: each counts once.
-    times_ns : iterable of int
-        Other times of the log, such as those of its first and last reading.
-    notes : iterable of str
-        Sentences about what could not be read.
+    They come in any order. Latched messages are published repeatedly, and standing alarms again
+    after a restart: each counts once. ``times_ns`` are other times of the log, such as those of
+    its first and last reading, ``notes`` what could not be read.
     """
     # A latched message from before the first plant time has time 0 and is ignored.
     found = sorted((m for m in told if m.time_ns > 0), key=lambda m: m.time_ns)
@@ -168,11 +115,14 @@ def history_of(
     if not found and not said:
         return None
     times = [*times_ns, *(m.time_ns for m in found)]
-    curves = _once((m for m in found if isinstance(m, CurveMoment)), lambda c: c.model_id)
-    diagnoses = _once((m for m in found if isinstance(m, DiagnosisMoment)), lambda d: d)
-    alarms = alarms_of(_once((m for m in found if isinstance(m, AlarmMoment)), lambda a: a))
+    curves: dict[str, CurveMoment] = {}
+    for m in found:
+        if isinstance(m, CurveMoment):
+            curves.setdefault(m.model_id, m)
+    alarms = alarms_of(dict.fromkeys(m for m in found if isinstance(m, AlarmMoment)))
+    diagnoses = dict.fromkeys(m for m in found if isinstance(m, DiagnosisMoment))
     return History(
-        min(times, default=0), max(times, default=0), tuple(curves), alarms,
+        min(times, default=0), max(times, default=0), tuple(curves.values()), alarms,
         tuple(diagnoses), said,
     )  # fmt: skip
 
@@ -196,14 +146,6 @@ def alarms_of(told: Iterable[AlarmMoment]) -> tuple[AlarmMoment, ...]:
         else:
             last.setdefault(a.name, None)
     return tuple(changes)
-
-
-def _once(items: Iterable[Item], key: Callable[[Item], Hashable]) -> list[Item]:
-    """Return each item only at its first occurrence."""
-    first: dict[Hashable, Item] = {}
-    for item in items:
-        first.setdefault(key(item), item)
-    return list(first.values())
 
 
 # Text, colour and symbol of each state that is drawn as a bar, the most severe first.
@@ -230,16 +172,15 @@ def history_sections(history: History | None) -> list[Section]:
         sections.append(Section('How the curve moved', _curves(history)))
     if history.alarms or history.diagnoses:
         changes, names = len(history.alarms), len(_names(history))
-        told = f'{counted(changes, "change")} of {counted(names, "alarm")}'
+        told = f'{say.counted(changes, "change")} of {say.counted(names, "alarm")}'
         if history.diagnoses:
-            told += f' and {counted(len(history.diagnoses), "diagnosis", "diagnoses")}'
-        told += f' from {period(history.start_ns, history.end_ns)}.'
-        sections.append(Section('What the monitor said', [
-            paragraph(told), timeline_figure(history), alarms_table(history),
-        ]))  # fmt: skip
+            told += f' and {say.counted(len(history.diagnoses), "diagnosis", "diagnoses")}'
+        told += f' from {say.period(history.start_ns, history.end_ns)}.'
+        parts = html.paragraph(told), timeline_figure(history), alarms_table(history)
+        sections.append(html.section('What the monitor said', *parts))
     if history.notes:
         sections = sections or [Section('What the monitor said')]
-        sections[-1].parts.extend(notice(text(n)) for n in history.notes)
+        sections[-1].parts.extend(html.notice(html.text(n)) for n in history.notes)
     return sections
 
 
@@ -264,29 +205,17 @@ def standing_spans(history: History, name: str = '') -> list[tuple[int, int]]:
     )
 
 
-def standing_s(history: History) -> float:
-    """Return the total time in which the condition of any alarm held, in s."""
-    held = standing_spans(history)
-    total, until = 0, -(1 << 62)
-    for begin, end in held:
-        total += max(0, end - max(begin, until))
-        until = max(until, end)
-    return total / 1e9
-
-
 def _names(history: History) -> list[str]:
     return list(dict.fromkeys(a.name for a in history.alarms))
 
 
 def _row_of(name: str) -> str:
-    """Return the name of an alarm for the figure and the table, as HTML."""
-    return text(name.replace('_', ' '))
+    return html.text(name.replace('_', ' '))
 
 
 def _broken(sentence: str) -> str:
-    """Split a sentence into lines for a hover text."""
     lines = ['']
-    for word in text(sentence).split():
+    for word in html.text(sentence).split():
         if lines[-1] and len(lines[-1]) + len(word) >= _LINE:
             lines.append(word)
         else:
@@ -298,16 +227,16 @@ def timeline_figure(history: History) -> Figure:
     """Return alarms by state, diagnoses and new curves over time."""
     said = {
         'new curve': ('line-ns-open', [
-            (c.time_ns, f'{counted(len(c.u) - 1, "piece")}, error {c.rmse_mw:.2f} MW')
+            (c.time_ns, f'{say.counted(len(c.u) - 1, "piece")}, error {c.rmse_mw:.2f} MW')
             for c in history.curves
         ]),
         'diagnosis': ('star', [(d.time_ns, _broken(d.sentence)) for d in history.diagnoses]),
     }  # fmt: skip
     traces = [
-        points(
-            moments([t / 1e6 for t, _ in found]), [row] * len(found), row, 'curve', size=9,
+        plot.points(
+            plot.moments([t / 1e6 for t, _ in found]), [row] * len(found), row, 'curve', size=9,
             showlegend=False, marker={'symbol': sign}, hoverinfo='text',
-            hovertext=[f'{moment(t)}<br>{words}' for t, words in found],
+            hovertext=[f'{say.moment(t)}<br>{words}' for t, words in found],
         )
         for row, (sign, found) in said.items() if found
     ]  # fmt: skip
@@ -316,9 +245,9 @@ def timeline_figure(history: History) -> Figure:
     names = _names(history)
     rows = [row for row, (_, found) in said.items() if found] + [_row_of(n) for n in names]
     room = 0.015 * (history.end_ns - history.start_ns)  # space for a symbol at each end
-    ends = moments([(history.start_ns - room) / 1e6, (history.end_ns + room) / 1e6])
+    ends = plot.moments([(history.start_ns - room) / 1e6, (history.end_ns + room) / 1e6])
     layout: Spec = {
-        'xaxis': time_axis(range=ends),
+        'xaxis': plot.time_axis(range=ends),
         'yaxis': {
             'type': 'category', 'categoryorder': 'array', 'categoryarray': rows[::-1],
             'range': [-0.6, len(rows) - 0.4], 'fixedrange': True,
@@ -330,8 +259,8 @@ def timeline_figure(history: History) -> Figure:
         'the same time.</b> A bar lasts as long as the alarm is in that state; a sign marks its '
         'beginning, and tells the sentence when pointed at. Where there is no bar, all was normal.'
     )
-    changes = counted(len(history.alarms), 'change')
-    words = f'Time line of {counted(len(names), "alarm")} with {changes}.'
+    changes = say.counted(len(history.alarms), 'change')
+    words = f'Time line of {say.counted(len(names), "alarm")} with {changes}.'
     height = 150 + _ROW * max(2, len(rows))
     return Figure('alarms', caption, words, traces, layout, height=height)
 
@@ -342,20 +271,20 @@ def _bars(history: History, state: AlarmState) -> list[Spec]:
     if not mine:
         return []
     # A gap between two intervals, so that no line connects them.
-    x = moments([t for _, _, a, b, _ in mine for t in (a / 1e6, b / 1e6, np.nan)])
+    x = plot.moments([t for _, _, a, b, _ in mine for t in (a / 1e6, b / 1e6, np.nan)])
     y = [cell for name, *_ in mine for cell in (_row_of(name), _row_of(name), None)]
     hover = [
-        f'{moment(a)}<br>{_row_of(name)}: {words} for {duration((b - a) / 1e9)}'
+        f'{say.moment(a)}<br>{_row_of(name)}: {words} for {say.duration((b - a) / 1e9)}'
         f'<br>{_broken(sentence)}'
         for name, _, a, b, sentence in mine
     ]
     return [
-        line(x, y, words, colour, width=14, legendgroup=words, showlegend=False),
-        points(
-            moments([a / 1e6 for _, _, a, _, _ in mine]), [_row_of(name) for name, *_ in mine],
-            words, colour, size=11, legendgroup=words, showlegend=True, hovertext=hover,
-            marker={'symbol': sign, 'line': {'color': token('ink'), 'width': 1}},
-            hoverinfo='text',
+        plot.line(x, y, words, colour, width=14, legendgroup=words, showlegend=False),
+        plot.points(
+            plot.moments([a / 1e6 for _, _, a, _, _ in mine]),
+            [_row_of(name) for name, *_ in mine], words, colour, size=11, legendgroup=words,
+            showlegend=True, hovertext=hover, hoverinfo='text',
+            marker={'symbol': sign, 'line': {'color': plot.token('ink'), 'width': 1}},
         ),
     ]  # fmt: skip
 
@@ -365,15 +294,22 @@ def alarms_table(history: History) -> str:
     if not history.alarms:
         return ''
     shown = history.alarms[-_MOST:]
-    rows = [[moment(a.time_ns), _row_of(a.name), _WORDS[a.state], text(a.sentence)] for a in shown]
-    stood = standing_s(history)
-    changes = counted(len(shown), 'change')
-    told = f'Some alarm stood for {duration(stood)} in all.' if stood else 'No alarm ever stood.'
+    rows = [
+        [say.moment(a.time_ns), _row_of(a.name), _WORDS[a.state], html.text(a.sentence)]
+        for a in shown
+    ]
+    stood, until = 0, -(1 << 62)  # ns in which the condition of any alarm held
+    for begin, end in standing_spans(history):
+        stood += max(0, end - max(begin, until))
+        until = max(until, end)
+    changes = say.counted(len(shown), 'change')
+    held = f'Some alarm stood for {say.duration(stood / 1e9)} in all.'
+    told = held if stood else 'No alarm ever stood.'
     if len(history.alarms) > len(shown):
         told += f' The last {changes}:'
-    body = table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)
+    body = html.table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)
     what = 'The change' if len(shown) == 1 else f'All {changes}'
-    return paragraph(told) + folded(f'{what} in words', body)
+    return html.paragraph(told) + html.folded(f'{what} in words', body)
 
 
 # How near the residual alarm was: its evidence is a share of the limit.
@@ -388,15 +324,8 @@ def largest_evidence(
     """Return time and size of the largest evidence outside alarms; None if there is none.
 
     The rise of the evidence before an alarm and its fall afterwards belong to the alarm: all rows
-    between two calm ones.
-
-    Parameters
-    ----------
-    time_ns : int64 (n,)
-    evidence : float64 (n,)
-        NaN where it was not judged.
-    alarms : sequence of (int, int)
-        Begin and end of each.
+    between two calm ones. The evidence (n,) is NaN where it was not judged; alarms have begin
+    and end.
     """
     judged = np.isfinite(evidence)
     time_ns, size = time_ns[judged], np.abs(evidence[judged])
@@ -412,27 +341,13 @@ def largest_evidence(
 
 
 def evidence_figure(
-    time_ns: IntArray,
-    average_mw: FloatArray,
-    evidence: FloatArray,
-    alarms: Sequence[tuple[int, int]],
-    period_ns: int,
-    limit_mw: float = 0.0,
-) -> Figure:
+    time_ns: IntArray, average_mw: FloatArray, evidence: FloatArray,
+    alarms: Sequence[tuple[int, int]], period_ns: int, limit_mw: float = 0.0,
+) -> Figure:  # fmt: skip
     """Return the mean residual and the evidence of its alarm over time.
 
-    Parameters
-    ----------
-    time_ns : int64 (n,)
-        Rising.
-    average_mw, evidence : float64 (n,)
-        NaN where the residual was not judged.
-    alarms : sequence of (int, int)
-        Begin and end of each.
-    period_ns : int
-        Step of the rows.
-    limit_mw : float
-        Fixed limit of the mean residual; 0 if the evidence is that of the control chart.
+    Both are NaN where the residual was not judged. ``limit_mw`` is the fixed limit of the mean
+    residual; 0 if the evidence is that of the control chart.
     """
     shown = 100.0 * np.clip(evidence, -_DRAWN_SHARE, _DRAWN_SHARE)
     traces = []
@@ -440,27 +355,27 @@ def evidence_figure(
         (average_mw, 'mean residual', 'y', '%{y:+.2f} MW'),
         (shown, 'evidence of the alarm', 'y2', '%{y:+.0f} % of the limit'),
     ):
-        start_ns, step_ns, ends = envelope(time_ns, values, _DRAWN_STRETCHES, period_ns)
-        at = moments((start_ns + step_ns * np.arange(len(ends))) / 1e6)
+        start_ns, step_ns, ends = plot.envelope(time_ns, values, _DRAWN_STRETCHES, period_ns)
+        at = plot.moments((start_ns + step_ns * np.arange(len(ends))) / 1e6)
         colour = 'data' if up == 'y' else 'chosen'
         hover = f'{DAY_HOUR}{hover}<extra></extra>'
-        traces.append(line(at, rounded(ends), name, colour, hover, width=1.2, yaxis=up))
+        traces.append(plot.line(at, plot.rounded(ends), name, colour, hover, width=1.2, yaxis=up))
     first, last = int(time_ns[0]) / 1e6, int(time_ns[-1]) / 1e6
-    across = moments([first, last, np.nan, first, last])
+    across = plot.moments([first, last, np.nan, first, last])
     for up, limit in (('y', limit_mw), ('y2', 100.0)):
         if limit > 0.0:
-            traces.append(line(
+            traces.append(plot.line(
                 across, [limit, limit, None, -limit, -limit], 'limit', 'steady', width=1.5,
                 dash='dash', yaxis=up, legendgroup='limit', showlegend=up == 'y2',
             ))  # fmt: skip
     layout: Spec = {
-        'xaxis': time_axis(anchor='y2', range=moments([first, last])),
-        'yaxis': axis('mean residual<br>(MW)', domain=[0.56, 1.0]),
-        'yaxis2': axis('evidence<br>(% of limit)', domain=[0.0, 0.46], range=[-135, 135]),
+        'xaxis': plot.time_axis(anchor='y2', range=plot.moments([first, last])),
+        'yaxis': plot.axis('mean residual<br>(MW)', domain=[0.56, 1.0]),
+        'yaxis2': plot.axis('evidence<br>(% of limit)', domain=[0.0, 0.46], range=[-135, 135]),
         'showlegend': True,
-        'shapes': [stripe(a / 1e6, b / 1e6, 'notice') for a, b in alarms],
+        'shapes': [plot.stripe(a / 1e6, b / 1e6, 'notice') for a, b in alarms],
     }
-    fixed = f', with its fixed limit of {decimals(limit_mw, 2)} MW' if limit_mw > 0.0 else ''
+    fixed = f', with its fixed limit of {say.decimals(limit_mw, 2)} MW' if limit_mw > 0.0 else ''
     rule = (
         'It is the mean residual divided by its limit.'
         if limit_mw > 0.0
@@ -476,8 +391,8 @@ def evidence_figure(
     )
     words = (
         f'Mean residual and evidence of the residual alarm over '
-        f'{duration((time_ns[-1] - time_ns[0]) / 1e9)}, with '
-        f'{counted(len(alarms), "interval")} in which the alarm stands.'
+        f'{say.duration((time_ns[-1] - time_ns[0]) / 1e9)}, with '
+        f'{say.counted(len(alarms), "interval")} in which the alarm stands.'
     )
     return Figure('evidence', caption, words, traces, layout, height=520)
 
@@ -492,23 +407,25 @@ _LOOKS = (
 def _curves(history: History) -> list[str | Figure]:
     found = history.curves
     words = (
-        f'{counted(len(found), "curve")}, the first of {moment(found[0].time_ns)}, the last of '
-        f'{moment(found[-1].time_ns)}.'
+        f'{say.counted(len(found), "curve")}, the first of {say.moment(found[0].time_ns)}, the '
+        f'last of {say.moment(found[-1].time_ns)}.'
     )
     if len(found) < 2:
-        return [paragraph(words)]
+        return [html.paragraph(words)]
     at, moved = largest_move(history)
     if np.isfinite(moved):
         last = found[-1]
-        place = f'{decimals(float(np.interp(at, last.u, last.power_mw)), 0)} MW'
+        place = f'{say.decimals(float(np.interp(at, last.u, last.power_mw)), 0)} MW'
         place += (
-            f' (u = {decimals(at, 0)})' if last.exponent else f' ({decimals(at, 1)} % opening)'
+            f' (u = {say.decimals(at, 0)})'
+            if last.exponent
+            else f' ({say.decimals(at, 1)} % opening)'
         )
         words += (
             f' The last curve differs most from the median of the earlier ones at '
-            f'{place}, by {decimals(moved, 2)} MW.'
+            f'{place}, by {say.decimals(moved, 2)} MW.'
         )
-    return [paragraph(words), curve_history_figure(history)]
+    return [html.paragraph(words), curve_history_figure(history)]
 
 
 def followed(history: History) -> FloatArray:
@@ -544,9 +461,11 @@ def curve_history_figure(history: History) -> Figure:
     """Return the power at fixed inputs and the breakpoints, over the times of the curves."""
     first, last = history.curves[0], history.curves[-1]
     layout: Spec = {
-        'xaxis': time_axis(anchor='y2'),
-        'yaxis': axis('power less<br>usual (MW)', domain=[0.5, 1.0]),
-        'yaxis2': axis(f'breakpoints<br>u ({input_unit(last.exponent)})', domain=[0.0, 0.42]),
+        'xaxis': plot.time_axis(anchor='y2'),
+        'yaxis': plot.axis('power less<br>usual (MW)', domain=[0.5, 1.0]),
+        'yaxis2': plot.axis(
+            f'breakpoints<br>u ({say.input_unit(last.exponent)})', domain=[0.0, 0.42]
+        ),
         'showlegend': True,
     }
     caption = (
@@ -557,10 +476,10 @@ def curve_history_figure(history: History) -> Figure:
         'may jump.'
     )
     words = (
-        f'{counted(len(history.curves), "curve")} over '
-        f'{duration((history.end_ns - first.time_ns) / 1e9)}; the last has '
-        f'{counted(len(last.u) - 1, "piece")} from '
-        f'u {plain(float(last.u[0]))} to {plain(float(last.u[-1]))}.'
+        f'{say.counted(len(history.curves), "curve")} over '
+        f'{say.duration((history.end_ns - first.time_ns) / 1e9)}; the last has '
+        f'{say.counted(len(last.u) - 1, "piece")} from '
+        f'u {say.plain(float(last.u[0]))} to {say.plain(float(last.u[-1]))}.'
     )
     traces = [*_power_lines(history), _knees(history)]
     return Figure('history', caption, words, traces, layout, height=560)
@@ -570,17 +489,17 @@ def _power_lines(history: History) -> list[Spec]:
     u = followed(history)
     # The last curve is valid until the end of the recording.
     times = [c.time_ns for c in history.curves]
-    at = moments([t / 1e6 for t in (*times, max(history.end_ns, times[-1]))])
+    at = plot.moments([t / 1e6 for t in (*times, max(history.end_ns, times[-1]))])
     traces = []
     for x, values, (colour, sign) in zip(u, powers(history.curves, u).T, _LOOKS, strict=True):
         known = values[np.isfinite(values)]
         usual = float(np.median(known)) if len(known) else float('nan')
         off = np.append(values, values[-1]) - usual
-        traces.append(line(
-            at, rounded(off), f'u = {x:.0f}', colour,
+        traces.append(plot.line(
+            at, plot.rounded(off), f'u = {x:.0f}', colour,
             f'{DAY_HOUR}u = {x:.0f}, usual {usual:.1f} MW<br>%{{y:+.2f}} MW<extra></extra>',
             width=1.8, shape='hv', mode='lines+markers',
-            marker={'color': token(colour), 'size': 7, 'symbol': sign},
+            marker={'color': plot.token(colour), 'size': 7, 'symbol': sign},
         ))  # fmt: skip
     return traces
 
@@ -592,8 +511,8 @@ def _knees(history: History) -> Spec:
         for u, lo, hi in zip(c.u[1:-1], c.low, c.high, strict=True)
     ]
     time_ms, u, low, high = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    return points(
-        moments(time_ms), rounded(u, 6), 'breakpoints, 95 %', 'curve',
+    return plot.points(
+        plot.moments(time_ms), plot.rounded(u, 6), 'breakpoints, 95 %', 'curve',
         f'{DAY_HOUR}breakpoint at u %{{y:.0f}}<extra></extra>', yaxis='y2',
-        error_y=error_bars(low, u, high, color=token('data'), thickness=1.5, width=3),
+        error_y=plot.error_bars(low, u, high, color=plot.token('data'), thickness=1.5, width=3),
     )  # fmt: skip

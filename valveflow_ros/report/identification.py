@@ -4,10 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.static_test import STATIC_RULE
 from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.parameters import PARAMETERS, Settings
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import (
     answer_words,
     breakpoints_table,
@@ -20,12 +24,7 @@ from valveflow_ros.report.answer import (
     temperature_words,
     window_words,
 )
-from valveflow_ros.report.curve import (
-    curve_figure,
-    opening_figure,
-    segments_figure,
-    shift_section,
-)
+from valveflow_ros.report.curve import curve_figure, opening_figure, segments_figure, shift_section
 from valveflow_ros.report.data import (
     coverage_figure,
     presence_figure,
@@ -35,18 +34,7 @@ from valveflow_ros.report.data import (
 )
 from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
-from valveflow_ros.report.page import (
-    Page,
-    Section,
-    bullets,
-    foot,
-    notice,
-    paragraph,
-    table,
-    text,
-    where,
-)
-from valveflow_ros.report.words import period, plain
+from valveflow_ros.report.page import Page, Section
 
 
 def identification_report(data: Identified) -> str:
@@ -60,76 +48,72 @@ def identification_page(data: Identified) -> Page:
     tag = data.settings.text('unit_tag')
     named = tag != PARAMETERS['unit_tag'].default
     title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
-    times = period(c.source.window_start_ns, c.source.window_end_ns)
-    # A figure without data is left out.
-    evidence = [signals_figure(data), segments_figure(data)]
-    missing = [presence_figure(data), coverage_figure(data)]
+    times = say.period(c.source.window_start_ns, c.source.window_end_ns)
     sections = [
-        Section('The answer', [
-            *([notice(text(data.mixture))] if data.mixture else []),
-            answer_words(data), gain_table(data), curve_figure(data),
-            *([against] if (against := opening_figure(data)) else []), pieces_table(data),
-            breakpoints_table(data.shown),
-        ]),
-        *([shift] if (shift := shift_section(data)) else []),
+        html.section(
+            'The answer', html.notice(html.text(data.mixture)) if data.mixture else None,
+            answer_words(data), gain_table(data), curve_figure(data), opening_figure(data),
+            pieces_table(data), breakpoints_table(data.shown),
+        ),
+        shift_section(data),
         *history_sections(data.history),
-        Section('The special segments', [f for f in evidence if f]),
+        html.section('The special segments', signals_figure(data), segments_figure(data)),
         _choice(c),
         _dynamics(c),
-        Section('The data', [
-            quality_words(data), quality_table(data), *(f for f in missing if f), _read(data),
-        ]),
-        Section('How it was made', [_settings(data.settings)]),
+        html.section(
+            'The data', quality_words(data), quality_table(data), presence_figure(data),
+            coverage_figure(data), *_read(data),
+        ),
+        html.section('How it was made', _settings(data.settings)),
     ]  # fmt: skip
-    end_of_page = foot(
-        f'Curve <code>{text(c.model_id)}</code>; the same numbers, unrounded, stand in '
+    end_of_page = html.foot(
+        f'Curve <code>{html.text(c.model_id)}</code>; the same numbers, unrounded, stand in '
         'characteristic.json beside this page.'
     )
-    lead = where(data.source, f'{times} ({window_words(c)})')
-    return Page(title, lead, sections, end_of_page, 'identify')
+    lead = html.where(data.source, f'{times} ({window_words(c)})')
+    return Page(title, lead, [s for s in sections if s], end_of_page, 'identify')
 
 
 def _choice(c: Characteristic) -> Section:
     """Return the choice of the number of pieces; without turning angles there is no figure."""
     title, choice = 'Why this number of pieces', c.choice
     if not choice.turning_angle and choice.rule in (RULE, STATIC_RULE):
-        return Section(title, [paragraph(text(choice.note))])
-    return Section(title, [choice_figure(choice, max(1, len(c.pieces))), confidence_table(choice)])
+        return html.section(title, html.paragraph(html.text(choice.note)))
+    figure = choice_figure(choice, max(1, len(c.pieces)))
+    return html.section(title, figure, confidence_table(choice))
 
 
 def _dynamics(c: Characteristic) -> Section:
     title = 'How fast the unit answers'
     if not c.dynamics:
         none = 'Time constants and delays were not estimated for this curve.'
-        return Section(title, [paragraph(none)])
-    figure = dynamics_figure(c.dynamics)
-    return Section(title, [dynamics_table(c.dynamics), *([] if figure is None else [figure])])
+        return html.section(title, html.paragraph(none))
+    return html.section(title, dynamics_table(c.dynamics), dynamics_figure(c.dynamics))
 
 
-def _read(data: Identified) -> str:
+def _read(data: Identified) -> Iterator[str]:
     c = data.characteristic
-    told = paragraph(text(temperature_words(c))) + paragraph(
+    yield html.paragraph(html.text(temperature_words(c)))
+    yield html.paragraph(
         f'Noise the thresholds stand on, as standard deviation of block means: '
-        f'{plain(c.residuals.input_noise, 3)} in u, {plain(c.residuals.power_noise_mw, 3)} MW '
-        'in power.'
+        f'{say.plain(c.residuals.input_noise, 3)} in u, '
+        f'{say.plain(c.residuals.power_noise_mw, 3)} MW in power.'
     )
-    return told + (bullets(map(text, data.notes)) if data.notes else '')
+    yield html.bullets(map(html.text, data.notes)) if data.notes else ''
 
 
 def _settings(settings: Settings) -> str:
-    """Return the parameters that differ from their default."""
     rows = [
-        [
-            text(name),
-            text(_shown(settings[name]) + (f' {row.unit}' if row.unit else '')),
-            text(_shown(row.default)),
-        ]
+        [html.text(cell) for cell in (
+            name, _shown(settings[name]) + (f' {row.unit}' if row.unit else ''),
+            _shown(row.default),
+        )]
         for name, row in PARAMETERS.items()
         if settings[name] != row.default and not name.startswith('refit_')
-    ]
+    ]  # fmt: skip
     if not rows:
-        return paragraph('Every parameter has its default value.')
-    return paragraph('Parameters that differ from their default:') + table(
+        return html.paragraph('Every parameter has its default value.')
+    return html.paragraph('Parameters that differ from their default:') + html.table(
         ['parameter', 'value', 'default'], rows
     )
 

@@ -27,75 +27,39 @@ from valveflow_ros.signals.static_form import OPENING
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """An identification and its data.
+    """An identification and its data."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the log, as given by the user.
-    characteristic : Characteristic
-    table : SampleTable
-        The aligned rows used by the engine.
-    segments : tuple of SpecialSegment
-        In order of time.
-    counts : mapping
-        ``{topic: {reason: readings}}`` as counted by the aligner.
-    settings : Settings
-    notes : tuple of str
-        Sentences about how the data were read.
-    shift : Shift, optional
-        The judgement against ``reference``, if there is one.
-    reference : Characteristic, optional
-    misfit : Misfit, optional
-        Systematic error of the curve.
-    mixture : str
-        A sentence that the unit changed within the data; empty if it did not.
-    history : History, optional
-        Messages of a monitor, if the log is its recording.
-    u : float64 (n,)
-        Argument of the curve in each row: integrated input or opening.
-    static_mw : float64 (n,)
-        Power of the curve in each row; the outer pieces are extrapolated.
-    rows : int64 (k, 2)
-        First and end row (exclusive) of each segment.
-    special : int64 (m,)
-        The rows inside segments with known input and power.
-    """
-
-    source: str
+    source: str  # name of the log, as given by the user
     characteristic: Characteristic
-    table: SampleTable
-    segments: tuple[SpecialSegment, ...]
-    counts: Mapping[str, Mapping[str, int]]
+    table: SampleTable  # the aligned rows used by the engine
+    segments: tuple[SpecialSegment, ...]  # in order of time
+    counts: Mapping[str, Mapping[str, int]]  # {topic: {reason: readings}}, of the aligner
     settings: Settings
-    notes: tuple[str, ...] = ()
-    shift: Shift | None = None
+    notes: tuple[str, ...] = ()  # about how the data were read
+    shift: Shift | None = None  # the judgement against the reference, if there is one
     reference: Characteristic | None = None
-    misfit: Misfit | None = None
-    mixture: str = ''
-    history: History | None = None
-    u: FloatArray = field(init=False)
-    static_mw: FloatArray = field(init=False)
-    rows: IntArray = field(init=False)
-    special: IntArray = field(init=False)
+    misfit: Misfit | None = None  # systematic error of the curve
+    mixture: str = ''  # a sentence that the unit changed within the data
+    history: History | None = None  # of a monitor, if the log is its recording
+    u: FloatArray = field(init=False)  # (n,) argument of the curve: integrated input or opening
+    static_mw: FloatArray = field(init=False)  # (n,) the curve; the outer pieces are extrapolated
+    rows: IntArray = field(init=False)  # (k, 2) first and end row (exclusive) of each segment
+    special: IntArray = field(init=False)  # (m,) rows in segments with known input and power
 
     def __post_init__(self) -> None:
-        """Compute the derived values."""
         u, scale = self.characteristic.static_form.of_rows(
-            self.table.column(Signal.VALVE_OPENING),
-            self.table.column(Signal.MAIN_STEAM_PRESSURE),
+            *self.table.values[:, [Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]].T
         )
-        object.__setattr__(self, 'u', u)
         static = self.characteristic.model.static(u, 1.0 if scale is None else scale)
-        object.__setattr__(self, 'static_mw', static)
         first = np.searchsorted(self.table.time_ns, [s.start_ns for s in self.segments])
         end = np.searchsorted(self.table.time_ns, [s.end_ns for s in self.segments], 'right')
         rows = np.column_stack([first, end]).astype(np.int64)
-        object.__setattr__(self, 'rows', rows)
         inside = [np.arange(a, b, dtype=np.int64) for a, b in rows.tolist()]
         special = np.concatenate([np.empty(0, dtype=np.int64), *inside])
         known = np.isfinite(u[special]) & np.isfinite(self.power[special])
-        object.__setattr__(self, 'special', special[known])
+        derived = {'u': u, 'static_mw': static, 'rows': rows, 'special': special[known]}
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     @property
     def power(self) -> FloatArray:

@@ -75,40 +75,26 @@ _FIGURE_WORDS = ('caption', 'description', 'traces', 'layout')
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of the page.
-
-    Attributes
-    ----------
-    title : str
-        Plain text.
-    parts : list
-        HTML (str) and figures in their order.
-    """
+    """A part of the page: a title as plain text, HTML and figures in their order."""
 
     title: str
     parts: list[str | Figure] = field(default_factory=list)
 
 
+def section(title: str, *parts: str | Figure | None) -> Section:
+    """Return a section; parts that are empty or None are left out."""
+    return Section(title, [part for part in parts if part])
+
+
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A report before it is written, as one page or as separate figures.
+    """A report before it is written, as one page or as separate figures."""
 
-    Attributes
-    ----------
-    title : str
-        Plain text, also the title of the window.
-    lead, foot : str
-        HTML below the title and at the end.
-    sections : list of Section
-    verb : str
-        The command that made the report; stored in the file for programs.
-    """
-
-    title: str
-    lead: str
+    title: str  # plain text, also of the window
+    lead: str  # HTML below the title
     sections: list[Section]
-    foot: str
-    verb: str
+    foot: str  # HTML at the end
+    verb: str  # the command that made the report; stored in the file for programs
 
     def in_unit(self, unit: str) -> Page:
         """Return the page with texts and figures for an output in another unit than MW."""
@@ -119,13 +105,11 @@ class Page:
         if zone is None:
             return self
         page = self._said(lambda text: in_zone(text, zone))
-        sections = [
-            Section(s.title, [
+        for s in page.sections:
+            s.parts[:] = [
                 pictures.in_zone(p, zone) if isinstance(p, Figure) else p for p in s.parts
-            ])
-            for s in page.sections
-        ]  # fmt: skip
-        return replace(page, sections=sections)
+            ]
+        return page
 
     def _said(self, change: Callable[[str], str]) -> Page:
         """Return the page with a function applied to all of its texts."""
@@ -190,20 +174,12 @@ def table(
     rows: Sequence[Sequence[str]],
     *,
     caption: str = '',
-    first: str = 'name',
     sentences: bool = False,
 ) -> str:
-    """Return a table of cells given as HTML.
+    """Return a table of cells given as HTML; with sentences it is treated as one of many columns.
 
     On a phone a table with many columns shows each row as a list; therefore each cell has the
     name of its column as an attribute.
-
-    Parameters
-    ----------
-    first : str
-        'name' if the first column names the row, 'number' if it is a value.
-    sentences : bool
-        Some cells are sentences: the table is treated as one with many columns.
     """
     # Attributes cannot contain HTML.
     labels = [without_tags(h).replace('&shy;', '').replace('"', '&quot;') for h in head]
@@ -211,7 +187,7 @@ def table(
 
     def cell(k: int, html: str) -> str:
         words = _breaks(html)
-        if k == 0 and first == 'name':
+        if k == 0:
             return f'<th scope="row" data-label="{labels[k]}">{html}</th>'
         # In the list layout, label and content are side by side: the content must be one element.
         whole = f'<span>{html}</span>' if many and '<' in html else html
@@ -265,9 +241,9 @@ def notice(html: str) -> str:
     return f'<p class="notice" role="note">{html}</p>'
 
 
-def _section(number: int, section: Section) -> str:
-    parts = ''.join(_figure(p) if isinstance(p, Figure) else p for p in section.parts)
-    return f'<section id="part-{number + 1}"><h2>{text(section.title)}</h2>{parts}</section>'
+def _section(number: int, told: Section) -> str:
+    parts = ''.join(_figure(p) if isinstance(p, Figure) else p for p in told.parts)
+    return f'<section id="part-{number + 1}"><h2>{text(told.title)}</h2>{parts}</section>'
 
 
 def _figure(figure: Figure) -> str:

@@ -14,45 +14,12 @@ from valveflow_ros.baselines.judged import JudgedSegment
 from valveflow_ros.baselines.validation import OTHER, PieceCheck, Validation, Verdict
 from valveflow_ros.fit.result import weaknesses
 from valveflow_ros.records import SegmentKind
+from valveflow_ros.report import figure as plot
+from valveflow_ros.report import page as html
+from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import misfit_words
-from valveflow_ros.report.figure import (
-    DAY_HOUR,
-    Figure,
-    Spec,
-    axis,
-    line,
-    packed,
-    points,
-    rounded,
-    time_axis,
-    token,
-)
-from valveflow_ros.report.page import (
-    Page,
-    Section,
-    bullets,
-    folded,
-    foot,
-    notice,
-    paragraph,
-    table,
-    text,
-    where,
-)
-from valveflow_ros.report.words import (
-    counted,
-    decimals,
-    duration,
-    input_axis,
-    input_unit,
-    interval,
-    moment,
-    percent,
-    period,
-    plain,
-    signed,
-    span,
-)
+from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
+from valveflow_ros.report.page import Page
 from valveflow_ros.segments.window import WindowContents
 
 LABELS = {
@@ -70,26 +37,15 @@ _DIFFERENCE = 'measured − predicted (MW)'
 
 @dataclass(frozen=True, slots=True)
 class Validated:
-    """A validation and its sources.
+    """A validation and its sources."""
 
-    Attributes
-    ----------
-    source, model, other : str
-        Names of the log and the models; ``other`` is empty without a second model.
-    result : Validation
-    contents : WindowContents
-    notes : tuple of str
-    held : str
-        A sentence about causes that were removed; empty if there are none.
-    """
-
-    source: str
+    source: str  # name of the log
     model: str
-    other: str
+    other: str  # the second model; empty without one
     result: Validation
     contents: WindowContents
     notes: tuple[str, ...] = ()
-    held: str = ''
+    held: str = ''  # a sentence about causes that were removed
 
 
 def verdict_words(data: Validated) -> list[str]:
@@ -100,24 +56,24 @@ def verdict_words(data: Validated) -> list[str]:
     worth, tested = j.passed(v.judged_by, as_paper=False)
     told = [
         _verdict(v),
-        f'{counted(steady, "steady-state segment")} and '
-        f'{counted(slope, "slope-response segment")} were judged; mean squared error '
-        f'{plain(j.mse(v.judged_by))} MW². In {worth} of the {tested} segments that can be tested '
-        'the mean difference is within its error (one independent value per '
-        f'{duration(j.widening * v.trial.step_s)}); in {each} if each sample is counted as '
+        f'{say.counted(steady, "steady-state segment")} and '
+        f'{say.counted(slope, "slope-response segment")} were judged; mean squared error '
+        f'{say.plain(j.mse(v.judged_by))} MW². In {worth} of the {tested} segments that can be '
+        'tested the mean difference is within its error (one independent value per '
+        f'{say.duration(j.widening * v.trial.step_s)}); in {each} if each sample is counted as '
         'independent, as the paper does.',
     ]
     if v.gain is not None:
         theirs = OTHER + ('simulated' if OTHER + 'simulated' in v.predictions else 'curve')
         better = f'{data.model if v.gain.mean > 0.0 else data.other} is better.'
         told.append(
-            f'{data.other} has a mean squared error of {plain(j.mse(theirs))} MW² there, '
-            f'against {plain(j.mse(v.judged_by))} MW² of {data.model}: '
+            f'{data.other} has a mean squared error of {say.plain(j.mse(theirs))} MW² there, '
+            f'against {say.plain(j.mse(v.judged_by))} MW² of {data.model}: '
             + (better if v.gain.zero_is_rejected() else 'the two cannot be told apart.')
         )
     if v.outside_share > OUTSIDE_FLAG:
         told.append(
-            f'{percent(v.outside_share, 2)} of the special samples lie beyond the ends of the '
+            f'{say.percent(v.outside_share, 2)} of the special samples lie beyond the ends of the '
             'curve, where nothing is known; they were not judged.'
         )
     place = v.characteristic.place_words
@@ -131,9 +87,9 @@ def _verdict(v: Validation) -> str:
         whole = check is v.overall
         where = '' if whole else f'at {place(check.u_from, check.u_to)} '
         return (
-            f'{where}the measured power differs by {signed(check.test.mean, 2)} MW'
+            f'{where}the measured power differs by {say.signed(check.test.mean, 2)} MW'
             f'{" (mean over the loads seen)" if whole else ""} from what it predicts '
-            f'({interval(check.low_mw, check.high_mw)} MW with 95 % confidence)'
+            f'({say.interval(check.low_mw, check.high_mw)} MW with 95 % confidence)'
         )
 
     tolerance, place = f'{v.tolerance_mw:.3g} MW', v.characteristic.place_words
@@ -164,7 +120,7 @@ def _verdict(v: Validation) -> str:
         which = f'For pieces {", ".join(most)} and {last}' if most else f'For piece {last}'
     size = math.sqrt(v.judgement.mse(v.judged_by))
     return (
-        f'The measured power differs from the prediction by {plain(size, 2)} MW (root mean '
+        f'The measured power differs from the prediction by {say.plain(size, 2)} MW (root mean '
         f'square); it cannot be decided whether the characteristic is valid: {mean}{real}. '
         f'{which} it cannot be told whether the difference is within {tolerance} or beyond. A '
         'longer log, with every load in it, would help.'
@@ -177,28 +133,27 @@ def validation_page(data: Validated) -> Page:
     first, *rest = verdict_words(data)
     flag = v.outside_share > OUTSIDE_FLAG
     sections = [
-        Section('The verdict', [
-            paragraph(text(first), 'answer'),
-            *(notice(text(s)) if flag and 'beyond the ends' in s else paragraph(text(s))
+        html.section(
+            'The verdict',
+            html.paragraph(html.text(first), 'answer'),
+            *((html.notice if flag and 'beyond the ends' in s else html.paragraph)(html.text(s))
               for s in rest),
-            notice(text(data.held)) if data.held else '',
-            input_figure(v),
+            html.notice(html.text(data.held)) if data.held else None, input_figure(v),
             pieces_table(v),
-        ]),
-        Section('When it differs', [time_figure(v)]),
-        Section('Predictions', [totals_table(v), segments_table(v)]),
+        ),
+        html.section('When it differs', time_figure(v)),
+        html.section('Predictions', totals_table(v), segments_table(v)),
     ]  # fmt: skip
     if data.notes:
-        sections.append(Section('How the data were read', [bullets(map(text, data.notes))]))
-    end = foot(
-        f'Curve <code>{text(v.characteristic.model_id)}</code>; the same numbers, unrounded, '
+        notes = html.bullets(map(html.text, data.notes))
+        sections.append(html.section('How the data were read', notes))
+    end = html.foot(
+        f'Curve <code>{html.text(v.characteristic.model_id)}</code>; the same numbers, unrounded, '
         'stand in validation.json and segments.csv.'
     )
     times = data.contents.time_ns
-    lead = where(
-        f'{data.model}, compared with {data.source}',
-        period(times[0], times[-1]),
-    )
+    compared = f'{data.model}, compared with {data.source}'
+    lead = html.where(compared, say.period(times[0], times[-1]))
     return Page('Does the flow characteristic hold?', lead, sections, end, 'validate')
 
 
@@ -207,25 +162,24 @@ def _markers(v: Validation, by_time: bool) -> list[Spec]:
     for kind, colour, name in _KINDS:
         mine = v.judgement.kinds(kind)
         means = [s.scores[v.judged_by].samples.mean for s in mine]
-        x: Any = rounded([float(v.trial.u[s.rows].mean()) for s in mine], 6)
+        x: Any = plot.rounded([float(v.trial.u[s.rows].mean()) for s in mine], 6)
         if by_time:
-            x = packed(np.array([0.5 * (s.start_ns + s.end_ns) / 1e6 for s in mine]))
+            x = plot.packed(np.array([0.5 * (s.start_ns + s.end_ns) / 1e6 for s in mine]))
         at = DAY_HOUR if by_time else 'u %{x:.0f}<br>'
-        traces.append(points(
-            x, rounded(means, 4), name, colour, f'{at}%{{y:+.2f}} MW<extra>{name}</extra>',
+        traces.append(plot.points(
+            x, plot.rounded(means, 4), name, colour, f'{at}%{{y:+.2f}} MW<extra>{name}</extra>',
             marker={'opacity': 0.75},
         ))  # fmt: skip
     return traces
 
 
 def _layout(v: Validation, across: Spec) -> Spec:
-    """Return the layout of a figure of differences, with the tolerance as a band."""
     tolerance = {
         'type': 'rect', 'xref': 'paper', 'yref': 'y', 'x0': 0, 'x1': 1, 'layer': 'below',
         'y0': -v.tolerance_mw, 'y1': v.tolerance_mw, 'line': {'width': 0},
-        'fillcolor': token('density-0'), 'opacity': 0.6,
+        'fillcolor': plot.token('density-0'), 'opacity': 0.6,
     }  # fmt: skip
-    return {'xaxis': across, 'yaxis': axis(_DIFFERENCE), 'shapes': [tolerance],
+    return {'xaxis': across, 'yaxis': plot.axis(_DIFFERENCE), 'shapes': [tolerance],
             'showlegend': True}  # fmt: skip
 
 
@@ -236,21 +190,21 @@ def input_figure(v: Validation) -> Figure:
     y = [mw for c in checks for mw in (c.test.mean, c.test.mean, math.nan)]
     traces = [
         *_markers(v, by_time=False),
-        line(rounded(x, 6), rounded(y, 4), 'mean of each piece', 'curve',
+        plot.line(plot.rounded(x, 6), plot.rounded(y, 4), 'mean of each piece', 'curve',
              '%{y:+.2f} MW<extra>mean of the piece</extra>', width=2.4),
     ]  # fmt: skip
     caption = (
         '<b>The points should scatter about zero at every u.</b> Each is the mean of a special '
         f'segment; the band is ± {v.tolerance_mw:.3g} MW.'
     )
-    layout = _layout(v, axis(input_axis(v.characteristic.pressure_exponent)))
+    layout = _layout(v, plot.axis(say.input_axis(v.characteristic.pressure_exponent)))
     return Figure('by-input', caption, 'Mean difference by input.', traces, layout, 400)
 
 
 def time_figure(v: Validation) -> Figure:
     """Return the mean difference of each segment over time."""
     caption = '<b>A step or a drift here is a change of the plant.</b> The same points over time.'
-    traces, layout = _markers(v, by_time=True), _layout(v, time_axis())
+    traces, layout = _markers(v, by_time=True), _layout(v, plot.time_axis())
     return Figure('by-time', caption, 'Mean difference over time.', traces, layout, 340)
 
 
@@ -258,28 +212,31 @@ def pieces_table(v: Validation) -> str:
     """Return the mean difference overall and on each piece."""
     rows = [
         [
-            f'piece {k}' if k else 'all', span(check.u_from, check.u_to), str(check.segments),
-            signed(check.test.mean, 2) if math.isfinite(check.test.mean) else '–',
-            interval(check.low_mw, check.high_mw),
-            decimals(check.test.effective, 0) if check.segments else '–',
+            f'piece {k}' if k else 'all', say.span(check.u_from, check.u_to), str(check.segments),
+            say.signed(check.test.mean, 2) if math.isfinite(check.test.mean) else '–',
+            say.interval(check.low_mw, check.high_mw),
+            say.decimals(check.test.effective, 0) if check.segments else '–',
         ]
         for k, check in enumerate((v.overall, *v.pieces))
     ]  # fmt: skip
     head = [
-        '', f'u ({input_unit(v.characteristic.pressure_exponent)})', 'segments', _DIFFERENCE,
+        '', f'u ({say.input_unit(v.characteristic.pressure_exponent)})', 'segments', _DIFFERENCE,
         '95 % (MW)', 'independent segments',
     ]  # fmt: skip
-    return table(head, rows)
+    return html.table(head, rows)
 
 
 def totals_table(v: Validation) -> str:
     """Return mean squared errors by kind of segment."""
     j, kinds = v.judgement, (None, SegmentKind.STEADY, SegmentKind.SLOPE)
     rows = [
-        [text(LABELS[name]), *(plain(j.mse(name, k)) if j.kinds(k) else '–' for k in kinds)]
+        [
+            html.text(LABELS[name]),
+            *(say.plain(j.mse(name, k)) if j.kinds(k) else '–' for k in kinds),
+        ]
         for name in v.predictions
     ]
-    return table(['prediction', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows)
+    return html.table(['prediction', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows)
 
 
 def segments_table(v: Validation, most: int = 40) -> str:
@@ -293,16 +250,16 @@ def segments_table(v: Validation, most: int = 40) -> str:
     for s in sorted(v.judgement.segments, key=size, reverse=True)[:most]:
         score = s.scores[v.judged_by]
         rows.append([
-            f'{s.kind.name.lower()} {s.number}', moment(s.start_ns)[:16], str(len(s.rows)),
-            decimals(s.power_mw, 0), plain(score.mse_mw2), signed(score.samples.mean, 2),
-            plain(score.samples.t, 2), plain(score.effective.t, 2),
-            decimals(score.effective.effective, 1),
+            f'{s.kind.name.lower()} {s.number}', say.moment(s.start_ns)[:16], str(len(s.rows)),
+            say.decimals(s.power_mw, 0), say.plain(score.mse_mw2),
+            say.signed(score.samples.mean, 2), say.plain(score.samples.t, 2),
+            say.plain(score.effective.t, 2), say.decimals(score.effective.effective, 1),
         ])  # fmt: skip
     head = [
         'segment', 'from', 'samples', 'MW', 'mean squared error (MW²)', _DIFFERENCE,
         't, each sample', 't, correlation counted', 'independent values',
     ]  # fmt: skip
-    many = counted(len(rows), 'segment')
+    many = say.counted(len(rows), 'segment')
     which = f'The {many} that differ most' if len(rows) < len(v.judgement.segments) else many
     words = 'All segments stand in segments.csv, those that differ most first here.'
-    return paragraph(words) + folded(which, table(head, rows))
+    return html.paragraph(words) + html.folded(which, html.table(head, rows))

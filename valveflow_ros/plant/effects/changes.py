@@ -4,26 +4,30 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import (
+from valveflow_ros.plant.effect import (  # fmt: skip
     DAY_S,
     ONSET,
-    Effect,
     Hooks,
-    LoopInputs,
     Values,
-    at_onset,
+    effect,
+    not_above,
     ramp,
     step,
 )
 from valveflow_ros.records import FloatArray
 
 
-def install_gain_drift(values: Values, hooks: Hooks) -> None:
+@effect(
+    'The power belonging to a flow rises or falls steadily.',
+    Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),
+)
+def gain_drift(values: Values, hooks: Hooks) -> None:
     """The power per flow drifts.
 
     Erosion and deposits after the valve, decreasing efficiency of the cycle, and a
@@ -31,23 +35,15 @@ def install_gain_drift(values: Values, hooks: Hooks) -> None:
 
         x = F(u) (1 + g t / 10 d),  t from the first row on
     """
-    g = values['g']
-
-    def change(rows: LoopInputs) -> None:
-        rows.gain[:] *= 1.0 + g * ramp(rows.time_s)
-
-    hooks.forcing.append(change)
+    hooks.scale_power(lambda rows: 1.0 + values['g'] * ramp(rows.time_s))
 
 
-GAIN_DRIFT = Effect(
-    'gain_drift',
-    'The power belonging to a flow rises or falls steadily.',
-    (Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),),
-    install_gain_drift,
+@effect(
+    'The power belonging to a flow changes at one moment.',
+    Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2),
+    ONSET,
 )
-
-
-def install_gain_step(values: Values, hooks: Hooks) -> None:
+def gain_step(values: Values, hooks: Hooks) -> None:
     """The power per flow changes suddenly and permanently.
 
     Possible causes are maintenance, another power meter, and a heater or an
@@ -55,23 +51,14 @@ def install_gain_step(values: Values, hooks: Hooks) -> None:
 
         x = F(u) (1 + g),  t >= t0
     """
-
-    def change(rows: LoopInputs) -> None:
-        rows.gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
-
-    hooks.forcing.append(change)
+    hooks.scale_power(lambda rows: 1.0 + values['g'] * step(rows.time_s, values))
 
 
-GAIN_STEP = Effect(
-    'gain_step',
-    'The power belonging to a flow changes at one moment.',
-    (Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2), ONSET),
-    install_gain_step,
-    starts_days=at_onset,
+@effect(
+    'The flow area belonging to a reading of u rises or falls steadily.',
+    Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),
 )
-
-
-def install_input_drift(values: Values, hooks: Hooks) -> None:
+def input_drift(values: Values, hooks: Hooks) -> None:
     """The error of the opening or of the pressure grows, or the seat wears.
 
     A drifting scale of the pressure transmitter, a drifting scale of the position
@@ -79,46 +66,29 @@ def install_input_drift(values: Values, hooks: Hooks) -> None:
 
         u_true = u (1 + g t / 10 d),  t from the first row on
     """
-    g = values['g']
-
-    def change(rows: LoopInputs) -> None:
-        rows.input_gain[:] *= 1.0 + g * ramp(rows.time_s)
-
-    hooks.forcing.append(change)
+    hooks.scale_input(lambda rows: 1.0 + values['g'] * ramp(rows.time_s))
 
 
-INPUT_DRIFT = Effect(
-    'input_drift',
-    'The flow area belonging to a reading of u rises or falls steadily.',
-    (Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),),
-    install_input_drift,
+@effect(
+    'The flow area belonging to a reading of u changes at one moment.',
+    Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2),
+    ONSET,
 )
-
-
-def install_input_step(values: Values, hooks: Hooks) -> None:
+def input_step(values: Values, hooks: Hooks) -> None:
     """The pressure or position transmitter is recalibrated.
 
     After that the same measured u corresponds to another flow area:
 
         u_true = u (1 + g),  t >= t0
     """
-
-    def change(rows: LoopInputs) -> None:
-        rows.input_gain[:] *= 1.0 + values['g'] * step(rows.time_s, values)
-
-    hooks.forcing.append(change)
+    hooks.scale_input(lambda rows: 1.0 + values['g'] * step(rows.time_s, values))
 
 
-INPUT_STEP = Effect(
-    'input_step',
-    'The flow area belonging to a reading of u changes at one moment.',
-    (Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2), ONSET),
-    install_input_step,
-    starts_days=at_onset,
+@effect(
+    'The power drifts by the same amount at any load.',
+    Parameter('b_mw', 2.0, 'MW/(10 d)', 'Change in ten days.', -50.0, 50.0),
 )
-
-
-def install_output_offset_drift(values: Values, hooks: Hooks) -> None:
+def output_offset_drift(values: Values, hooks: Hooks) -> None:
     """The zero of the power drifts.
 
     A drifting zero of the power transducer, or a slowly growing auxiliary load,
@@ -126,20 +96,7 @@ def install_output_offset_drift(values: Values, hooks: Hooks) -> None:
 
         y = G x + b t / 10 d,  t from the first row on
     """
-    b_mw = values['b_mw']
-
-    def change(rows: LoopInputs) -> None:
-        rows.offset_mw[:] += b_mw * ramp(rows.time_s)
-
-    hooks.forcing.append(change)
-
-
-OUTPUT_OFFSET_DRIFT = Effect(
-    'output_offset_drift',
-    'The power drifts by the same amount at any load.',
-    (Parameter('b_mw', 2.0, 'MW/(10 d)', 'Change in ten days.', -50.0, 50.0),),
-    install_output_offset_drift,
-)
+    hooks.add_power(lambda rows: values['b_mw'] * ramp(rows.time_s))
 
 
 _HOUR_S = 3600.0
@@ -157,15 +114,22 @@ def _draw(values: Values) -> Iterator[tuple[float, float]]:
 
 def intervals_s(values: Values, length_s: float) -> FloatArray:
     """Return start and end of every interval that begins in a run, (k, 2), in seconds."""
-    rows = []
-    for start, end in _draw(values):
-        if start >= length_s:
-            break
-        rows.append((start, end))
-    return np.array(rows).reshape(-1, 2)
+    rows = itertools.takewhile(lambda row: row[0] < length_s, _draw(values))
+    return np.array(list(rows)).reshape(-1, 2)
 
 
-def install_intervals(values: Values, hooks: Hooks) -> None:
+@effect(
+    'For hours at a time the power belonging to a flow is another one.',
+    Parameter('g', -0.01, '', 'Relative change inside an interval.', -0.2, 0.2),
+    Parameter('on_low_h', 5.0, 'h', 'Shortest interval.', 0.1, 1000.0),
+    Parameter('on_high_h', 22.0, 'h', 'Longest interval.', 0.1, 1000.0),
+    Parameter('off_low_h', 24.0, 'h', 'Shortest pause.', 0.1, 1000.0),
+    Parameter('off_high_h', 60.0, 'h', 'Longest pause.', 0.1, 1000.0),
+    Parameter('pattern', 1, '', 'Which sequence of times.', 0, 2**31 - 1),
+    starts_days=lambda values: next(_draw(values))[0] / DAY_S,
+    problem=not_above(('on_low_h', 'on_high_h'), ('off_low_h', 'off_high_h')),
+)
+def intervals(values: Values, hooks: Hooks) -> None:
     """At some times a part of the steam or of the heat is used elsewhere.
 
     An extraction or a feed water heater is in or out of service for hours:
@@ -176,45 +140,17 @@ def install_intervals(values: Values, hooks: Hooks) -> None:
     separate random generator is used: ``pattern`` defines a fixed sequence of times.
     """
     edges = intervals_s(values, hooks.length_s).ravel()
-
-    def change(rows: LoopInputs) -> None:
-        inside = np.searchsorted(edges, rows.time_s, side='right') % 2
-        rows.gain[:] *= 1.0 + values['g'] * inside
-
-    hooks.forcing.append(change)
+    hooks.scale_power(
+        lambda rows: 1.0 + values['g'] * (np.searchsorted(edges, rows.time_s, side='right') % 2)
+    )
 
 
-def starts_days(values: Values) -> float:
-    """Return when the first interval begins."""
-    return next(_draw(values))[0] / DAY_S
-
-
-def problem(values: Values) -> str:
-    """Return which bounds are in the wrong order."""
-    for state in ('on', 'off'):
-        if values[f'{state}_low_h'] > values[f'{state}_high_h']:
-            return f'{state}_low_h must not exceed {state}_high_h'
-    return ''
-
-
-INTERVALS = Effect(
-    'intervals',
-    'For hours at a time the power belonging to a flow is another one.',
-    (
-        Parameter('g', -0.01, '', 'Relative change inside an interval.', -0.2, 0.2),
-        Parameter('on_low_h', 5.0, 'h', 'Shortest interval.', 0.1, 1000.0),
-        Parameter('on_high_h', 22.0, 'h', 'Longest interval.', 0.1, 1000.0),
-        Parameter('off_low_h', 24.0, 'h', 'Shortest pause.', 0.1, 1000.0),
-        Parameter('off_high_h', 60.0, 'h', 'Longest pause.', 0.1, 1000.0),
-        Parameter('pattern', 1, '', 'Which sequence of times.', 0, 2**31 - 1),
-    ),
-    install_intervals,
-    starts_days=starts_days,
-    problem=problem,
+@effect(
+    'The power belonging to a flow rises and falls once a day.',
+    Parameter('a', 0.005, '', 'Relative amplitude.', -0.2, 0.2),
+    Parameter('peak_h', 5.0, 'h', 'Time of day of the highest power, UTC.', 0.0, 24.0),
 )
-
-
-def install_diurnal(values: Values, hooks: Hooks) -> None:
+def diurnal(values: Values, hooks: Hooks) -> None:
     """The power depends on the time of day.
 
     The pressure in the condenser depends on the ambient air or the cooling water, and
@@ -223,20 +159,6 @@ def install_diurnal(values: Values, hooks: Hooks) -> None:
         x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
     """
     peak_s = values['peak_h'] * 3600.0
-
-    def change(rows: LoopInputs) -> None:
-        wave = np.cos(2.0 * np.pi * (rows.clock_s - peak_s) / DAY_S)
-        rows.gain[:] *= 1.0 + values['a'] * wave
-
-    hooks.forcing.append(change)
-
-
-DIURNAL = Effect(
-    'diurnal',
-    'The power belonging to a flow rises and falls once a day.',
-    (
-        Parameter('a', 0.005, '', 'Relative amplitude.', -0.2, 0.2),
-        Parameter('peak_h', 5.0, 'h', 'Time of day of the highest power, UTC.', 0.0, 24.0),
-    ),
-    install_diurnal,
-)
+    hooks.scale_power(
+        lambda rows: 1.0 + values['a'] * np.cos(2.0 * np.pi * (rows.clock_s - peak_s) / DAY_S)
+    )

@@ -7,12 +7,18 @@ from __future__ import annotations
 import numpy as np
 
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import DAY_S, ONSET, AddedCurve, Effect, Hooks, Values, at_onset
+from valveflow_ros.plant.effect import DAY_S, ONSET, AddedCurve, Hooks, Values, effect
 
 _POINTS = 65
 
 
-def install_curve_shape(values: Values, hooks: Hooks) -> None:
+@effect(
+    'The curve has a bump between its breakpoints.',
+    Parameter('h_mw', 1.5, 'MW', 'Height of the bump.', -50.0, 50.0),
+    Parameter('u0', 1425.0, '% MPa^(9/8)', 'Its centre.', 0.0, 1e5),
+    Parameter('width_u', 150.0, '% MPa^(9/8)', 'From its centre to its foot.', 1.0, 1e4),
+)
+def curve_shape(values: Values, hooks: Hooks) -> None:
     """The curve has a bump that few straight pieces cannot describe.
 
     If a valve begins to open before the previous one is open, their overlap raises
@@ -27,19 +33,15 @@ def install_curve_shape(values: Values, hooks: Hooks) -> None:
     hooks.added_curves.append(AddedCurve(u, values['h_mw'] * bump))
 
 
-CURVE_SHAPE = Effect(
-    'curve_shape',
-    'The curve has a bump between its breakpoints.',
-    (
-        Parameter('h_mw', 1.5, 'MW', 'Height of the bump.', -50.0, 50.0),
-        Parameter('u0', 1425.0, '% MPa^(9/8)', 'Its centre.', 0.0, 1e5),
-        Parameter('width_u', 150.0, '% MPa^(9/8)', 'From its centre to its foot.', 1.0, 1e4),
-    ),
-    install_curve_shape,
+@effect(
+    'At one moment the share of one valve is lost from the curve.',
+    Parameter('s_mw', -2.5, 'MW', 'Power added where the valve is open.', -50.0, 50.0),
+    Parameter('u_from', 1450.0, '% MPa^(9/8)', 'Where the valve should begin to open.', 0.0, 1e5),
+    Parameter('u_to', 1750.0, '% MPa^(9/8)', 'Where it should be open.', 0.0, 1e5),
+    ONSET,
+    problem=lambda v: '' if v['u_from'] < v['u_to'] else 'u_from must be less than u_to',
 )
-
-
-def install_curve_step(values: Values, hooks: Hooks) -> None:
+def curve_step(values: Values, hooks: Hooks) -> None:
     """One of several valves no longer opens.
 
     The curve is the sum of valves that open in sequence. If one of them sticks, if
@@ -51,25 +53,3 @@ def install_curve_step(values: Values, hooks: Hooks) -> None:
     u = np.array([values['u_from'], values['u_to']])
     share = np.array([0.0, values['s_mw']])
     hooks.added_curves.append(AddedCurve(u, share, values['t0_days'] * DAY_S))
-
-
-def problem(values: Values) -> str:
-    """Return what is wrong with the range of u."""
-    return '' if values['u_from'] < values['u_to'] else 'u_from must be less than u_to'
-
-
-CURVE_STEP = Effect(
-    'curve_step',
-    'At one moment the share of one valve is lost from the curve.',
-    (
-        Parameter('s_mw', -2.5, 'MW', 'Power added where the valve is open.', -50.0, 50.0),
-        Parameter(
-            'u_from', 1450.0, '% MPa^(9/8)', 'Where the valve should begin to open.', 0.0, 1e5
-        ),
-        Parameter('u_to', 1750.0, '% MPa^(9/8)', 'Where it should be open.', 0.0, 1e5),
-        ONSET,
-    ),
-    install_curve_step,
-    starts_days=at_onset,
-    problem=problem,
-)

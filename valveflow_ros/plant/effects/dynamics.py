@@ -9,11 +9,17 @@ import dataclasses
 import numpy as np
 
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import Effect, Hooks, Values
+from valveflow_ros.plant.effect import Hooks, Values, effect
 from valveflow_ros.plant.unit import Region
 
 
-def install_region_lag(values: Values, hooks: Hooks) -> None:
+@effect(
+    'Above a load the unit answers with another time constant and delay.',
+    Parameter('time_s', 30.0, 's', 'Time constant above the level.', 0.1, 1000.0),
+    Parameter('delay_s', 3.0, 's', 'Delay above the level.', 0.0, 600.0),
+    Parameter('level_mw', 240.0, 'MW', 'Where it begins.', 1.0, 10_000.0),
+)
+def region_lag(values: Values, hooks: Hooks) -> None:
     """Above a load the unit stores more steam and responds more slowly.
 
     The regional dynamics G_i of eq. (3): above ``level_mw`` the unit has the given
@@ -30,19 +36,12 @@ def install_region_lag(values: Values, hooks: Hooks) -> None:
     hooks.regions = (*kept, above)
 
 
-REGION_LAG = Effect(
-    'region_lag',
-    'Above a load the unit answers with another time constant and delay.',
-    (
-        Parameter('time_s', 30.0, 's', 'Time constant above the level.', 0.1, 1000.0),
-        Parameter('delay_s', 3.0, 's', 'Delay above the level.', 0.0, 600.0),
-        Parameter('level_mw', 240.0, 'MW', 'Where it begins.', 1.0, 10_000.0),
-    ),
-    install_region_lag,
+@effect(
+    'Part of the power follows later, through the reheater.',
+    Parameter('alpha', 0.3, '', 'Share made in front of the reheater.', 0.0, 1.0),
+    Parameter('time_s', 20.0, 's', 'Time constant of the reheater.', 0.0, 600.0),
 )
-
-
-def install_reheater(values: Values, hooks: Hooks) -> None:
+def reheater(values: Values, hooks: Hooks) -> None:
     """Most of the power is generated after the reheater, which fills slowly.
 
     The turbine models of IEEE (IEEEG1, TGOV1) divide the power: a fraction is generated
@@ -53,14 +52,3 @@ def install_reheater(values: Values, hooks: Hooks) -> None:
     hooks.claim('reheater')
     hooks.reheater_share = values['alpha']
     hooks.reheater_s = values['time_s']
-
-
-REHEATER = Effect(
-    'reheater',
-    'Part of the power follows later, through the reheater.',
-    (
-        Parameter('alpha', 0.3, '', 'Share made in front of the reheater.', 0.0, 1.0),
-        Parameter('time_s', 20.0, 's', 'Time constant of the reheater.', 0.0, 600.0),
-    ),
-    install_reheater,
-)

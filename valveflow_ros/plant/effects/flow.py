@@ -8,10 +8,15 @@ import numpy as np
 
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import Effect, Hooks, LoopInputs, Values
+from valveflow_ros.plant.effect import Hooks, Values, effect
 
 
-def install_exponent(values: Values, hooks: Hooks) -> None:
+@effect(
+    'The flow follows another power of the pressure than eq. (1) says.',
+    Parameter('dm', 0.06, '', 'True exponent minus that of eq. (1).', -0.5, 0.5),
+    Parameter('reference_mpa', 13.0, 'MPa', 'Pressure of no change.', 1.0, 40.0),
+)
+def exponent(values: Values, hooks: Hooks) -> None:
     """The exponent of the pressure differs from 9/8.
 
     The 9/8 of eq. (1) comes from the drum boiler model of Bell and Astrom, fitted
@@ -20,29 +25,21 @@ def install_exponent(values: Values, hooks: Hooks) -> None:
 
         u_true = u (p / p_ref)^dm
     """
-    dm, reference = values['dm'], values['reference_mpa']
-
-    def change(rows: LoopInputs) -> None:
-        rows.input_gain[:] *= (rows.pressure_mpa / reference) ** dm
-
-    hooks.forcing.append(change)
-
-
-EXPONENT = Effect(
-    'exponent',
-    'The flow follows another power of the pressure than eq. (1) says.',
-    (
-        Parameter('dm', 0.06, '', 'True exponent minus that of eq. (1).', -0.5, 0.5),
-        Parameter('reference_mpa', 13.0, 'MPa', 'Pressure of no change.', 1.0, 40.0),
-    ),
-    install_exponent,
-)
+    reference = values['reference_mpa']
+    hooks.scale_input(lambda rows: (rows.pressure_mpa / reference) ** values['dm'])
 
 
 _LARGEST_USUAL_RATIO = 0.9
 
 
-def install_choked(values: Values, hooks: Hooks) -> None:
+@effect(
+    'At high load the valve is not choked and the pressure behind it throttles the flow.',
+    Parameter(
+        'kappa', 0.038, 'MPa/MW', 'Pressure behind the valve per power; 0: choked.', 0.0, 0.1
+    ),
+    Parameter('critical_ratio', 0.546, '', 'Pressure ratio of choked flow.', 0.3, 0.8),
+)
+def choked(values: Values, hooks: Hooks) -> None:
     """The flow is not choked: it depends on the pressure after the valve.
 
     Below the critical ratio of the pressures after and before a nozzle the flow
@@ -72,20 +69,12 @@ def install_choked(values: Values, hooks: Hooks) -> None:
     hooks.critical_ratio = values['critical_ratio']
 
 
-CHOKED = Effect(
-    'choked',
-    'At high load the valve is not choked and the pressure behind it throttles the flow.',
-    (
-        Parameter(
-            'kappa', 0.038, 'MPa/MW', 'Pressure behind the valve per power; 0: choked.', 0.0, 0.1
-        ),
-        Parameter('critical_ratio', 0.546, '', 'Pressure ratio of choked flow.', 0.3, 0.8),
-    ),
-    install_choked,
+@effect(
+    'The power depends on the main steam temperature.',
+    Parameter('k', -0.0006, '1/K', 'Relative change of the power per kelvin.', -0.01, 0.01),
+    Parameter('reference_degc', 539.0, 'degC', 'Temperature of no change.', 300.0, 700.0),
 )
-
-
-def install_temperature(values: Values, hooks: Hooks) -> None:
+def temperature(values: Values, hooks: Hooks) -> None:
     """The power depends on the main steam temperature, which the paper assumes constant.
 
     A turbine has a constant swallowing capacity, m ~ p / sqrt(T_K) (the cone law
@@ -95,20 +84,5 @@ def install_temperature(values: Values, hooks: Hooks) -> None:
 
         x = F(u) (1 + k (T - T_ref))
     """
-    k, reference = values['k'], values['reference_degc']
-
-    def change(rows: LoopInputs) -> None:
-        rows.gain[:] *= 1.0 + k * (rows.temperature_degc - reference)
-
-    hooks.forcing.append(change)
-
-
-TEMPERATURE = Effect(
-    'temperature',
-    'The power depends on the main steam temperature.',
-    (
-        Parameter('k', -0.0006, '1/K', 'Relative change of the power per kelvin.', -0.01, 0.01),
-        Parameter('reference_degc', 539.0, 'degC', 'Temperature of no change.', 300.0, 700.0),
-    ),
-    install_temperature,
-)
+    reference = values['reference_degc']
+    hooks.scale_power(lambda rows: 1.0 + values['k'] * (rows.temperature_degc - reference))

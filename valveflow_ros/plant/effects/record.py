@@ -4,25 +4,29 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
 from valveflow_ros.parameters import Parameter
-from valveflow_ros.plant.effect import (
+from valveflow_ros.plant.effect import (  # fmt: skip
     DAY_S,
     ONSET,
     SIGNAL,
-    Effect,
     HistorianRows,
     Hooks,
     Values,
-    at_onset,
+    effect,
 )
 from valveflow_ros.records import FloatArray
 
 
-def install_clock(values: Values, hooks: Hooks) -> None:
+@effect(
+    'The power is stamped earlier (or later) than it was measured.',
+    Parameter('d_s', 12.0, 's', 'How much too early; negative: too late.', -600.0, 600.0),
+)
+def clock(values: Values, hooks: Hooks) -> None:
     """The stamps of the power come from another clock.
 
         y in the row of time t was measured at t + d
@@ -34,15 +38,13 @@ def install_clock(values: Values, hooks: Hooks) -> None:
     hooks.lead_s = values['d_s']
 
 
-CLOCK = Effect(
-    'clock',
-    'The power is stamped earlier (or later) than it was measured.',
-    (Parameter('d_s', 12.0, 's', 'How much too early; negative: too late.', -600.0, 600.0),),
-    install_clock,
+@effect(
+    'A recorded signal stands still for a while.',
+    SIGNAL,
+    Parameter('minutes', 120.0, 'min', 'How long.', 0.0, 1e6),
+    ONSET,
 )
-
-
-def install_flatline(values: Values, hooks: Hooks) -> None:
+def flatline(values: Values, hooks: Hooks) -> None:
     """A recorded value is constant: a stuck transmitter or a gateway that repeats a value.
 
     After the onset the last value is repeated in the record; the plant is not affected.
@@ -62,20 +64,12 @@ def install_flatline(values: Values, hooks: Hooks) -> None:
     hooks.writing.append(change)
 
 
-FLATLINE = Effect(
-    'flatline',
-    'A recorded signal stands still for a while.',
-    (
-        SIGNAL,
-        Parameter('minutes', 120.0, 'min', 'How long.', 0.0, 1e6),
-        ONSET,
-    ),
-    install_flatline,
-    starts_days=at_onset,
+@effect(
+    'A recorded signal has a coarse step.',
+    SIGNAL,
+    Parameter('step', 5.0, "the signal's", 'Step of the record; 0: none.', 0.0, 100.0),
 )
-
-
-def install_quantisation(values: Values, hooks: Hooks) -> None:
+def quantisation(values: Values, hooks: Hooks) -> None:
     """The record has a coarse resolution: few bits, or a historian's dead band.
 
     Every value is rounded to the nearest multiple of ``step``.
@@ -90,17 +84,6 @@ def install_quantisation(values: Values, hooks: Hooks) -> None:
     hooks.writing.append(change)
 
 
-QUANTISATION = Effect(
-    'quantisation',
-    'A recorded signal has a coarse step.',
-    (
-        SIGNAL,
-        Parameter('step', 5.0, "the signal's", 'Step of the record; 0: none.', 0.0, 100.0),
-    ),
-    install_quantisation,
-)
-
-
 def _draw(values: Values) -> Iterator[tuple[float, float]]:
     """Yield time in seconds and sign of successive spikes."""
     rng = np.random.default_rng([int(values['pattern']), 2])
@@ -110,17 +93,21 @@ def _draw(values: Values) -> Iterator[tuple[float, float]]:
         yield now, 1.0 if rng.random() < 0.5 else -1.0
 
 
-def spikes(values: Values, length_s: float) -> FloatArray:
+def spikes_s(values: Values, length_s: float) -> FloatArray:
     """Return time in seconds and sign of every spike of a run, (k, 2)."""
-    rows = []
-    for now, sign in _draw(values):
-        if now >= length_s:
-            break
-        rows.append((now, sign))
-    return np.array(rows).reshape(-1, 2)
+    rows = itertools.takewhile(lambda row: row[0] < length_s, _draw(values))
+    return np.array(list(rows)).reshape(-1, 2)
 
 
-def install_spikes(values: Values, hooks: Hooks) -> None:
+@effect(
+    'A recorded signal has single outliers.',
+    SIGNAL,
+    Parameter('height', 20.0, "the signal's", 'Height, up or down.', 0.0, 1e4),
+    Parameter('per_day', 10.0, '1/d', 'How many a day on average.', 0.01, 10_000.0),
+    Parameter('pattern', 1, '', 'Which set of times and signs.', 0, 2**31 - 1),
+    starts_days=lambda values: next(_draw(values))[0] / DAY_S,
+)
+def spikes(values: Values, hooks: Hooks) -> None:
     """The record has single outliers: disturbed transmission.
 
     Their times are a Poisson process and their signs are random. They come from a
@@ -128,7 +115,7 @@ def install_spikes(values: Values, hooks: Hooks) -> None:
     """
     signal = values.signal()
     h = hooks.unit.sample_period_s
-    drawn = spikes(values, hooks.length_s)
+    drawn = spikes_s(values, hooks.length_s)
     row_of_spike, sign = np.floor(drawn[:, 0] / h), drawn[:, 1]
 
     def change(rows: HistorianRows) -> None:
@@ -139,22 +126,3 @@ def install_spikes(values: Values, hooks: Hooks) -> None:
         np.add.at(rows.columns[signal], place[here].astype(int), values['height'] * sign[here])
 
     hooks.writing.append(change)
-
-
-def starts_days(values: Values) -> float:
-    """Return the time of the first spike."""
-    return next(_draw(values))[0] / DAY_S
-
-
-SPIKES = Effect(
-    'spikes',
-    'A recorded signal has single outliers.',
-    (
-        SIGNAL,
-        Parameter('height', 20.0, "the signal's", 'Height, up or down.', 0.0, 1e4),
-        Parameter('per_day', 10.0, '1/d', 'How many a day on average.', 0.01, 10_000.0),
-        Parameter('pattern', 1, '', 'Which set of times and signs.', 0, 2**31 - 1),
-    ),
-    install_spikes,
-    starts_days=starts_days,
-)

@@ -53,21 +53,13 @@ class MonitorState:
     """The state of a monitor according to its messages, with bounded memory.
 
     Messages are mappings from field to value, independent of their transport.
-
-    Attributes
-    ----------
-    inputs : tuple of HealthView
-        Set by a caller that has a better source than `/diagnostics`.
-    recorder : HealthView or None
-        The same for the recorder.
-    items : tuple of ItemView
-        All items of this monitor in `/diagnostics`.
     """
 
     def __init__(self) -> None:
+        # Both may be set by a caller that has a better source than `/diagnostics`.
         self.inputs: tuple[HealthView, ...] = ()
         self.recorder: HealthView | None = None
-        self.items: tuple[ItemView, ...] = ()
+        self.items: tuple[ItemView, ...] = ()  # all of this monitor in `/diagnostics`
         self._unit = ''
         # The tag in the messages of the monitor, and in the health used; None: no message yet.
         self._tag: str | None = None
@@ -208,7 +200,6 @@ def _age_ns(fit: Fields) -> int:
 
 
 def _item(status: Fields) -> HealthView:
-    """Return an item of the health, without the name of the monitor."""
     level = status['level']
     number = level[0] if isinstance(level, bytes) else int(level)
     return HealthView(_item_name(status), number, str(status['message']))

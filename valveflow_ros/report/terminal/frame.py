@@ -13,22 +13,14 @@ from valveflow_ros.report.words import counted, decimals, duration, moment, sign
 # The numbers of the messages in plain words.
 CURVE_STATES = ('no curve yet', 'fresh', 'stale', 'refused', 'provisional')
 SAMPLE_STATES = (
-    'no curve yet',
-    'plant in motion',
-    'steady state',
-    'on a long ramp',
-    'outside the curve',
+    'no curve yet', 'plant in motion', 'steady state', 'on a long ramp', 'outside the curve',
     'bad or missing data',
-)
+)  # fmt: skip
 ALARM_STATES = (
-    'normal',
-    'ALARM, not acknowledged',
-    'ALARM, acknowledged',
-    'gone by itself, not acknowledged',
-    'shelved for a time',
-    'cannot be judged now',
+    'normal', 'ALARM, not acknowledged', 'ALARM, acknowledged',
+    'gone by itself, not acknowledged', 'shelved for a time', 'cannot be judged now',
     'out of service',
-)
+)  # fmt: skip
 VERDICTS = ('not diagnosed yet', 'no cause found', 'cause named', 'unexplained')
 NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED = 0, 1, 2
 OUTSIDE, BAD_DATA = 4, 5
@@ -37,64 +29,33 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 
 @dataclass(frozen=True, slots=True)
 class CurveView:
-    """The flow characteristic.
+    """The flow characteristic."""
 
-    Attributes
-    ----------
-    breakpoints, values : tuple of float
-        u in % MPa^m and power in MW at the ends of the pieces; empty without a curve.
-    state : int
-        Index in `CURVE_STATES`.
-    cause : str
-        Why it is not up to date.
-    model_id : str
-    window : tuple of int
-        First and last time of its data in ns; 0 if there are none.
-    samples : int
-    rmse_mw : float
-    shift : str
-        The judgement against the reference; empty if there is none.
-    exponent : float
-        The m of u = V p^m; NaN if unknown.
-    """
-
-    breakpoints: tuple[float, ...]
-    values: tuple[float, ...]
-    state: int
-    cause: str
+    breakpoints: tuple[float, ...]  # u in % MPa^m of the ends of the pieces; empty: no curve
+    values: tuple[float, ...]  # power in MW there
+    state: int  # index in `CURVE_STATES`
+    cause: str  # why it is not up to date
     model_id: str
-    window: tuple[int, int]
+    window: tuple[int, int]  # first and last time of its data in ns; 0 if there are none
     samples: int
     rmse_mw: float
-    shift: str
-    exponent: float = math.nan
+    shift: str  # the judgement against the reference; empty if there is none
+    exponent: float = math.nan  # the m of u = V p^m; NaN if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class SampleView:
-    """One sample and the prediction of the curve; NaN if unknown.
-
-    Attributes
-    ----------
-    time_ns : int
-    state : int
-        Index in `SAMPLE_STATES`.
-    u, measured_mw, residual_mw, average_mw : float
-    low_mw, high_mw : float
-        Expected 95 % range of the residual.
-    evidence : float
-        Beyond 1 or -1 the alarm is raised.
-    """
+    """One sample and the prediction of the curve; NaN if unknown."""
 
     time_ns: int
-    state: int
+    state: int  # index in `SAMPLE_STATES`
     u: float
     measured_mw: float
     residual_mw: float
-    average_mw: float
-    low_mw: float
+    average_mw: float  # running mean of the residual
+    low_mw: float  # expected 95 % range of the residual
     high_mw: float
-    evidence: float
+    evidence: float  # beyond 1 or -1 the alarm is raised
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,48 +84,23 @@ class HealthView:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisView:
-    """The last diagnosis.
+    """The last diagnosis."""
 
-    Attributes
-    ----------
-    verdict : int
-        Index in `VERDICTS`.
-    sentence : str
-    causes : tuple of str
-        Names of the causes.
-    until_ns : int
-        End of the data.
-    advice : tuple of str
-        Effect of each cause in MW and the recommended action, if known.
-    """
-
-    verdict: int
+    verdict: int  # index in `VERDICTS`
     sentence: str
-    causes: tuple[str, ...]
-    until_ns: int
-    advice: tuple[str, ...] = ()
+    causes: tuple[str, ...]  # their names
+    until_ns: int  # end of the data
+    advice: tuple[str, ...] = ()  # effect of each cause in MW, and what to do, if known
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The complete content of the view at one time.
+    """The complete content of the view at one time."""
 
-    Attributes
-    ----------
-    unit : str
-        Tag of the unit; empty if unknown.
-    source : str
-        Description of the data source.
-    now_ns : int
-        Time of the plant; 0 before the first message.
-    note : str
-        A sentence at the top, for example what the view is waiting for.
-    """
-
-    unit: str = ''
-    source: str = ''
-    now_ns: int = 0
-    note: str = ''
+    unit: str = ''  # its tag; empty if unknown
+    source: str = ''  # description of the data source
+    now_ns: int = 0  # time of the plant; 0 before the first message
+    note: str = ''  # at the top, for example what the view is waiting for
     curve: CurveView | None = None
     last: SampleView | None = None
     samples: tuple[SampleView, ...] = ()
@@ -175,7 +111,6 @@ class Frame:
 
 
 def _word(words: tuple[str, ...], number: int) -> str:
-    """Return the word for a number of a message; unknown numbers are returned as text."""
     return words[number] if 0 <= number < len(words) else f'state {number}'
 
 
@@ -183,12 +118,10 @@ def _word(words: tuple[str, ...], number: int) -> str:
 Said = tuple[str, str]
 NONE_YET = 'None yet.'
 _SHORT = {
-    'valve_opening': 'opening',
-    'main_steam_pressure': 'pressure',
-    'main_steam_temperature': 'temperature',
-    'generated_power': 'power',
+    'valve_opening': 'opening', 'main_steam_pressure': 'pressure',
+    'main_steam_temperature': 'temperature', 'generated_power': 'power',
     'valve_command': 'command',
-}
+}  # fmt: skip
 _TONES = {OK: '', WARN: 'warn', STALE: 'bad'}
 
 
@@ -234,12 +167,10 @@ def sample_words(sample: SampleView | None) -> Said:
 
 def alarm_words(alarm: AlarmView) -> Said:
     """Return the state of an alarm in words."""
-    raised = f', raised {_minute(alarm.raised_ns)}'
-    if not (alarm.standing and alarm.raised_ns):
-        raised = ''
-    tone = {UNACKNOWLEDGED: 'bad', ACKNOWLEDGED: 'bad'}.get(alarm.state, 'warn')
+    known = alarm.standing and alarm.raised_ns
+    raised = f', raised {_minute(alarm.raised_ns)}' if known else ''
     text = f'{alarm.name}: {_word(ALARM_STATES, alarm.state)}{raised}. {alarm.sentence}'
-    return text, tone
+    return text, 'bad' if alarm.state in (UNACKNOWLEDGED, ACKNOWLEDGED) else 'warn'
 
 
 def alarms_words(frame: Frame) -> list[Said]:
@@ -284,16 +215,13 @@ def recorder_words(frame: Frame) -> Said:
 def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     """Return the result of the last diagnosis in words."""
     if diagnosis is None:
-        return 'None yet.', 'dim'
+        return NONE_YET, 'dim'
     if not diagnosis.verdict and diagnosis.sentence:
         return diagnosis.sentence, 'dim'
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''
-    until = ''
-    if diagnosis.until_ns:
-        until = f' in the data until {_minute(diagnosis.until_ns)}'
+    until = f' in the data until {_minute(diagnosis.until_ns)}' if diagnosis.until_ns else ''
     text = f'{_word(VERDICTS, diagnosis.verdict)}{names}{until}. {diagnosis.sentence}'
-    text = ' '.join([text, *diagnosis.advice])
-    return text, 'warn' if diagnosis.verdict in (2, 3) else ''
+    return ' '.join([text, *diagnosis.advice]), 'warn' if diagnosis.verdict in (2, 3) else ''
 
 
 def _minute(time_ns: int) -> str:

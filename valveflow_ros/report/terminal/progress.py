@@ -21,26 +21,17 @@ _FIRST_LINE_S, _LONGER, _LONGEST_PAUSE_S = 15.0, 2.0, 120.0
 
 
 class Progress:
-    """Keeps a bar or lines up to date; updates the time also between two calls.
+    """Keeps a bar, or a few lines, up to date; updates the time also between two calls.
 
-    Parameters
-    ----------
-    err : text stream
-    bar : bool
-        Draw a bar; otherwise write a few lines.
-    share_of_time : callable, optional
-        Converts the reported fraction of the work and its description to a fraction of the time.
-    clock : callable
-        Monotonic time in s.
+    ``share_of_time`` converts the reported fraction of the work and its description to a fraction
+    of the time.
     """
 
     def __init__(
-        self,
-        err: TextIO,
-        bar: bool,
+        self, err: TextIO, bar: bool,
         share_of_time: Callable[[float, str], float] = lambda share, _what: share,
         clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._err, self._bar, self._clock = err, bar, clock
         self._share_of_time = share_of_time
         wide = (getattr(err, 'encoding', None) or 'utf-8').lower().startswith('utf')
@@ -70,7 +61,9 @@ class Progress:
             # Progress never decreases.
             self._share = max(self._share, min(max(self._share_of_time(share, what), 0.0), 1.0))
             self._what = what
-            self._estimate(now)
+            gone = now - self._begun_s
+            if gone >= _LEAST_S and self._share >= _LEAST_SHARE:
+                self._ends_s = now + gone * (1.0 - self._share) / self._share
             if new or now - self._drawn_s >= _REDRAW_S:
                 self._tell(now)
 
@@ -108,12 +101,6 @@ class Progress:
         """Return the estimated remaining time in seconds; infinity if unknown."""
         return max(0.0, self._ends_s - self._clock())
 
-    def _estimate(self, now: float) -> None:
-        assert self._begun_s is not None
-        gone = now - self._begun_s
-        if gone >= _LEAST_S and self._share >= _LEAST_SHARE:
-            self._ends_s = now + gone * (1.0 - self._share) / self._share
-
     def _tell(self, now: float) -> None:
         if self._bar:
             self._draw(now)
@@ -137,13 +124,11 @@ class Progress:
         self._shown = True
 
     def _gone(self, now: float) -> str:
-        """Return the elapsed time, or '' if it is very short."""
         assert self._begun_s is not None
         gone = now - self._begun_s
         return f'{in_words(gone)} so far  ' if gone >= _LEAST_S else ''
 
     def _left(self, now: float) -> str:
-        """Return the remaining time, or '' if unknown."""
         left = self._ends_s - now
         return f'about {in_words(left)} left  ' if math.isfinite(left) and left >= 0.5 else ''
 

@@ -9,25 +9,15 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import tzinfo
 from itertools import pairwise
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import TextIO
 
 from valveflow_ros.records import NS_PER_S
-from valveflow_ros.report.terminal.frame import (
-    Frame,
-    SampleView,
-    alarm_words,
-    alarms_words,
-    curve_words,
-    diagnosis_words,
-    health_words,
-    inputs_words,
-    recorder_words,
-    sample_words,
-)
+from valveflow_ros.report.terminal import frame as views
+from valveflow_ros.report.terminal.frame import Frame, SampleView
 from valveflow_ros.report.terminal.text import Line, cells, clean, cut, labelled, painted
 from valveflow_ros.report.words import duration, in_zone, input_unit_plain, moment, signed
 
@@ -49,14 +39,8 @@ _WHOLE = 100  # maximum lines of a sentence printed in full
 class Canvas:
     """A rectangle of characters for lines and marks.
 
-    Parameters
-    ----------
-    width, height : int
-        In characters, at least 1 each.
-    low, high : tuple of float
-        The lower left and the upper right corner, in data units.
-    unicode : bool
-        True if braille characters may be used; otherwise a dot is an asterisk.
+    ``low`` and ``high`` are its lower left and its upper right corner, in data units. With
+    ``unicode`` a dot is one of eight of a braille character, otherwise an asterisk.
     """
 
     def __init__(
@@ -109,10 +93,8 @@ class Canvas:
 
     def rows(self) -> list[str]:
         """Return the lines of characters from top to bottom, each as long as the width."""
-        return [
-            ''.join(self._character(row, column) for column in range(self.width))
-            for row in range(self.height)
-        ]
+        across = range(self.width)
+        return [''.join(self._character(row, k) for k in across) for row in range(self.height)]
 
     def _put(self, across: int, down: int) -> None:
         column, row = across // DOTS_X, down // DOTS_Y
@@ -132,19 +114,9 @@ def screen(
     frame: Frame, width: int, height: int, *, colour: bool = False, unicode: bool = True,
     zone: tzinfo | None = None, whole: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Return a frame as the lines for a terminal.
+    """Return a frame as the lines for a terminal, never more or longer than its size.
 
-    Parameters
-    ----------
-    frame : Frame
-    width, height : int
-        Size of the terminal; the lines are never more or longer than it.
-    colour, unicode : bool
-        Capabilities of the terminal.
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
-    whole : bool
-        Print every sentence in full, in as many additional lines as needed.
+    With ``whole`` every sentence is printed in full, in as many additional lines as needed.
     """
     lines = _lines(frame, max(20, width), max(5, height), unicode, zone, whole)
     shown = lines if whole else lines[: max(1, height)]
@@ -158,11 +130,11 @@ def _lines(
     head = [_title(frame, width, zone)]
     if frame.note:
         head += labelled('         ', in_zone(frame.note, zone), 'warn', width, most)
-    curve_text, tone = curve_words(frame.curve, frame.now_ns)
+    curve_text, tone = views.curve_words(frame.curve, frame.now_ns)
     head += labelled('Curve    ', in_zone(curve_text, zone), tone, width, most)
     text = _text(frame, width, _WHOLE if whole else 1, zone)
     height += len(text) if whole else 0
-    residual = list(labelled('Residual ', *sample_words(frame.last), width, 2))
+    residual = list(labelled('Residual ', *views.sample_words(frame.last), width, 2))
     left = height - len(head) - len(residual) - len(text)
     curve_rows, residual_rows = _shares(left, frame)
     spare = left - (curve_rows + 1 if curve_rows else 0) - residual_rows
@@ -202,13 +174,12 @@ def _title(frame: Frame, width: int, zone: tzinfo | None) -> Line:
 
 
 def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line]:
-    """Return alarms, inputs, recorder and diagnosis, each in at most ``most`` lines."""
     lines: list[Line] = []
     for label, told in (
-        ('Alarms   ', alarms_words(frame)),
-        ('Inputs   ', inputs_words(frame)),
-        ('Recorder ', [recorder_words(frame)]),
-        ('Diagnosis', [diagnosis_words(frame.diagnosis)]),
+        ('Alarms   ', views.alarms_words(frame)),
+        ('Inputs   ', views.inputs_words(frame)),
+        ('Recorder ', [views.recorder_words(frame)]),
+        ('Diagnosis', [views.diagnosis_words(frame.diagnosis)]),
     ):
         for k, (text, tone) in enumerate(told):
             before = label if k == 0 else ' ' * len(label)
@@ -217,7 +188,6 @@ def _text(frame: Frame, width: int, most: int, zone: tzinfo | None) -> list[Line
 
 
 def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
-    """Return the curve with its breakpoints and the operating point, and its axis."""
     curve, last = frame.curve, frame.last
     pairs = zip(curve.breakpoints, curve.values, strict=False) if curve else ()
     points = [pair for pair in pairs if all(map(math.isfinite, pair))]
@@ -242,7 +212,6 @@ def _curve(frame: Frame, width: int, rows: int, unicode: bool) -> list[Line]:
 
 
 def _strip(samples: Sequence[SampleView], width: int, rows: int, unicode: bool) -> list[Line]:
-    """Return the last residuals over time with their limits."""
     known = [s for s in samples if math.isfinite(s.residual_mw)]
     if not known:
         return []
@@ -285,40 +254,32 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
         yield 'note', now.note
     if now.curve is not None and now.curve != before.curve:
         # The age of the curve is not a change.
-        yield 'curve', curve_words(now.curve, 0)[0]
+        yield 'curve', views.curve_words(now.curve, 0)[0]
     old = {alarm.name: alarm for alarm in before.alarms}
     for alarm in now.alarms:
         if old.get(alarm.name) != alarm:
-            yield 'alarm', alarm_words(alarm)[0]
+            yield 'alarm', views.alarm_words(alarm)[0]
     levels = {item.name: item.level for item in before.inputs}
     for item in now.inputs:
         if levels.get(item.name) != item.level:
-            yield 'input', health_words(item)[0]
+            yield 'input', views.health_words(item)[0]
     old_level = None if before.recorder is None else before.recorder.level
     if now.recorder is not None and now.recorder.level != old_level:
         yield 'recorder', now.recorder.sentence
     if now.diagnosis is not None and now.diagnosis != before.diagnosis:
-        yield 'diagnosis', diagnosis_words(now.diagnosis)[0]
+        yield 'diagnosis', views.diagnosis_words(now.diagnosis)[0]
 
 
 class Screen:
     """Show frames: in place on a terminal, otherwise as one line per change.
 
-    Parameters
-    ----------
-    out : text stream
-    environment : mapping, optional
-        Source of ``TERM`` and ``NO_COLOR``; the process environment by default.
-    zone : tzinfo, optional
-        Time zone of the times; UTC by default.
+    ``environment`` has ``TERM`` and ``NO_COLOR``; by default it is that of the process.
     """
 
     def __init__(
-        self,
-        out: TextIO,
-        environment: Mapping[str, str] | None = None,
+        self, out: TextIO, environment: Mapping[str, str] | None = None,
         zone: tzinfo | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         known = os.environ if environment is None else environment
         self._out, self._zone = out, zone
         terminal = out.isatty()
@@ -326,29 +287,27 @@ class Screen:
         self._colour = self.in_place and not known.get('NO_COLOR')
         self._unicode = (out.encoding or '').lower().replace('-', '').startswith('utf')
         self._before = Frame()
-        self._entered = False
-        self._handlers: dict[signal.Signals, object] = {}
+        self._open = ExitStack()
 
     def __enter__(self) -> Screen:
         """Prepare the terminal; termination signals raise `KeyboardInterrupt` from now on."""
-        self._handlers = _handled()
+        self._open.enter_context(ending())
         if self.in_place:
             self._out.write(_ENTER)
-            self._entered = True
+            self._open.callback(self._leave)
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
+        self, kind: type[BaseException] | None, error: BaseException | None,
         trace: TracebackType | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Restore the terminal."""
-        if self._entered:
-            with suppress(OSError):
-                self._out.write(_LEAVE)
-                self._out.flush()
-        _put_back(self._handlers)
+        self._open.close()
+
+    def _leave(self) -> None:
+        with suppress(OSError):
+            self._out.write(_LEAVE)
+            self._out.flush()
 
     def show(self, frame: Frame) -> None:
         """Show a frame, or its changes since the last one."""
@@ -376,29 +335,15 @@ class Screen:
         )  # fmt: skip
 
 
-def _handled() -> dict[signal.Signals, object]:
-    """Make termination signals raise `KeyboardInterrupt`; return the earlier handlers."""
-    before: dict[signal.Signals, object] = {}
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        with suppress(ValueError):  # not in the main thread
-            before[number] = signal.signal(number, _interrupt)
-    return before
-
-
-def _put_back(handlers: Mapping[signal.Signals, object]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, handler)  # type: ignore[arg-type]
-
-
 @contextmanager
 def ending() -> Iterator[None]:
     """Make termination signals raise `KeyboardInterrupt` inside the context."""
-    before = _handled()
+    before = {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with suppress(ValueError):  # not in the main thread
+            before[number] = signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:
-        _put_back(before)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+        for number, handler in before.items():
+            signal.signal(number, handler)

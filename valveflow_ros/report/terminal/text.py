@@ -9,6 +9,7 @@ import re
 import unicodedata
 from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 # Pieces of a line: the text of each, and one of the styles below or '' for plain.
 Line = tuple[tuple[str, str], ...]
@@ -92,24 +93,11 @@ def painted(line: Line, width: int, colour: bool, unicode: bool = True) -> str:
 def number(
     wanted: str, low: float, high: float, example: str, *, above: bool = False
 ) -> Callable[[str], float]:
-    """Return a parser of numbers for ``type=`` of an option.
+    """Return a parser of finite numbers from ``low`` to ``high`` for ``type=`` of an option.
 
-    Parameters
-    ----------
-    wanted : str
-        Description with unit: 'a number of days'.
-    low, high : float
-        The range; if both ends are infinite, any finite number is allowed.
-    example : str
-        A correct example: '--days 10'.
-    above : bool
-        True if ``low`` itself is not allowed.
-
-    Returns
-    -------
-    callable
-        It raises `ArgumentTypeError` with a text that follows the name of the option: 'must be a
-        number of days above 0 and at most 400, such as --days 10; 'ten' is no number'.
+    With ``above``, ``low`` itself is not allowed. The parser raises `ArgumentTypeError` with a
+    text that follows the name of the option: 'must be a number of days above 0 and at most 400,
+    such as --days 10; 'ten' is no number', of ``wanted`` 'a number of days'.
     """
     # No powers of ten: 1000000 is easier to read than 1e+06.
     first, last = f'{low:.15g}', f'{high:.15g}'
@@ -117,30 +105,36 @@ def number(
     if math.isinf(low) and math.isinf(high):
         between = ''
 
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            raise _refusal(wanted, between, example, f"'{text}' is no number") from None
-        if not (math.isfinite(value) and low <= value <= high) or (above and value == low):
-            raise _refusal(wanted, between, example, f"'{text}' is not")
-        return value
-
-    return read
+    return _parser(
+        float, 'number', f'{wanted}{between}', example,
+        lambda v: math.isfinite(v) and low <= v <= high and not (above and v == low),
+    )  # fmt: skip
 
 
 def whole(wanted: str, low: int, high: int | None, example: str) -> Callable[[str], int]:
     """Return a parser of whole numbers; parameters and errors as for `number`."""
     between = f' of {low} or more' if high is None else f' from {low} to {high}'
+    top = math.inf if high is None else high
+    return _parser(
+        int, 'whole number', f'{wanted}{between}', example, lambda value: low <= value <= top
+    )
 
-    def read(text: str) -> int:
+
+Number = TypeVar('Number', int, float)
+
+
+def _parser(
+    kind: type[Number], noun: str, wanted: str, example: str, fits: Callable[[Number], bool]
+) -> Callable[[str], Number]:
+    def read(text: str) -> Number:
+        why = f"'{text}' is not"
         try:
-            value = int(text)
+            value = kind(text)
+            if fits(value):
+                return value
         except ValueError:
-            raise _refusal(wanted, between, example, f"'{text}' is no whole number") from None
-        if value < low or (high is not None and value > high):
-            raise _refusal(wanted, between, example, f"'{text}' is not")
-        return value
+            why = f"'{text}' is no {noun}"
+        raise ArgumentTypeError(f'must be {wanted}, such as {example}; {why}')
 
     return read
 
@@ -165,7 +159,3 @@ def _zone(text: str) -> str:
             f"must be a time zone, such as Europe/Berlin or +01:00; '{text}' is not"
         ) from None
     return text
-
-
-def _refusal(wanted: str, between: str, example: str, why: str) -> ArgumentTypeError:
-    return ArgumentTypeError(f'must be {wanted}{between}, such as {example}; {why}')
