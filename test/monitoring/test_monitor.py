@@ -18,12 +18,10 @@ from streams import (
     examples,
     first_difference,
     frozen,
-    grid_ns,
     of_type,
     plant_table,
     story,
     table_harms,
-    table_of,
     taken_up,
 )
 
@@ -283,19 +281,6 @@ def test_a_fault_raises_one_alarm_which_stays_until_acknowledged_and_no_fit_mixe
         monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
 
 
-def test_an_outage_without_rows_raises_no_alarm():
-    """The load was another one afterwards: nothing is wrong with the valve."""
-    monitor = with_curve()
-    monitor.reconfigure(BY_HAND)
-    knots = monitor.characteristic.breakpoints
-    u = np.where(np.arange(300) < 150, knots[0] + 20.0, knots[-1] - 20.0)
-    time_ns = grid_ns(300, start_ns=monitor.last_ns + NS_PER_S)
-    time_ns[150:] += 3600 * NS_PER_S
-    events = feed_rows(monitor, table_of(time_ns, u, 20.0 + 0.1 * u))
-    assert of_type(events, AlarmChange) == []
-    assert np.nanmax(np.abs(column(events, 'residual_mw'))) < 3.0
-
-
 def test_the_evidence_is_the_share_of_the_fixed_limit_or_what_the_chart_of_the_curve_says():
     part = plant_table(9, 400, [('fault', 0, 400)])
     events = feed_rows(with_curve(), part)
@@ -361,27 +346,3 @@ def test_live_settings_may_change_and_leave_an_entry_others_may_not():
 
 
 # --- hostile --------------------------------------------------------------------------------
-
-
-def test_a_valve_that_never_moves_is_refused_with_the_reason():
-    power = 170.0 + 0.15 * np.random.default_rng(0).normal(0.0, 1.0, 400)
-    monitor = Monitor(SETTINGS)
-    events = feed_rows(monitor, table_of(grid_ns(400), np.full(400, 1500.0), power))
-    refused = [e for e in of_type(events, JournalEntry) if e.kind == JournalKind.FIT_REFUSED]
-    assert 'several openings' in refused[0].text
-    assert monitor.status == CurveStatus.REFUSED
-
-
-@pytest.mark.parametrize('offset', [1e6, -1e6])
-def test_a_huge_offset_of_the_power_only_shifts_the_curve(offset):
-    shifted = plant_table(0, N)
-    shifted.values[:, Signal.GENERATED_POWER] += offset
-    there = Monitor(SETTINGS)
-    events = feed_rows(there, shifted)
-    here, told = _run()[0].characteristic, _run()[1]
-    knots = here.breakpoints
-    assert there.characteristic.breakpoints == pytest.approx(knots, abs=1e-3)
-    u = 0.5 * (knots[1:] + knots[:-1])
-    assert there.characteristic(u) - offset == pytest.approx(here(u), abs=1e-3)
-    residual = column(told, 'residual_mw')
-    assert column(events, 'residual_mw') == pytest.approx(residual, abs=1e-3, nan_ok=True)

@@ -10,7 +10,6 @@ from alarm_story import NERVOUS
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import (
-    INTERPRETED,
     QUICK_MONITOR,
     START_NS,
     blocks_of,
@@ -153,17 +152,6 @@ def test_rows_and_journal_repeat_any_run_bit_for_bit(seed, harms, steps, nervous
     live.rows(N, 40)
     places = data.draw(cuts(N, most=8))
     same(live.events, replayed(settings, live.table, live.journal(), places))
-
-
-@pytest.mark.parametrize('at', range(290, 330, 20 if INTERPRETED else 6))
-def test_a_segment_closed_by_an_outage_asks_at_the_same_row_again(at):
-    """What shows the outage is the row after it."""
-    for late in (0, 5):
-        live = LiveRun(SETTINGS.changed({'refit_segments': 1}),
-                       plant_table(4, 500, [('leap', at, 60)]))  # fmt: skip
-        live.rows(500, late)
-        again = replayed(live.monitor.settings, live.table, live.journal())
-        same(live.events, again)
 
 
 def test_a_run_with_every_button_pressed_is_repeated():

@@ -164,15 +164,6 @@ def middle_of(monitor):
     return monitor.characteristic.model.static(at)[0]
 
 
-def test_a_new_reference_accepts_what_was_wrong():
-    monitor = healthy()
-    feed_rows(monitor, after(monitor, 2, N, added_mw=8.0))
-    monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
-    monitor.set_reference()
-    assert not monitor.alarm.active
-    assert not named(feed_rows(monitor, after(monitor, 3, 1000, added_mw=8.0)), 'residual')
-
-
 def test_a_state_of_before_goes_on():
     """States of earlier versions have neither regime nor a curve of its own that predicts."""
     state = from_bytes(to_bytes(healthy().snapshot()))

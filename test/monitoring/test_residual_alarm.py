@@ -211,48 +211,6 @@ def test_what_is_told_and_when(settings, steps, wanted):
     assert not any('nan' in c.sentence for _, c in told)
 
 
-@pytest.mark.parametrize('latch', [True, False])
-@pytest.mark.parametrize('flood', [2, 5])
-def test_a_value_that_chatters_is_counted_and_told_in_few_words(latch, flood):
-    """Half an hour of coming and going every second, with neither delay nor dead band."""
-    given = {**NERVOUS, 'alarm_latch': latch, 'alarm_flood': flood}
-    alarm, told = lived(given, ([2.0, 0.0], 1800))
-    changes = [c for _, c in told]
-    announced = [c for c in changes if c.state == UNACKNOWLEDGED]
-    assert (announced[0], announced[0].occurrence) == (changes[0], 1)
-    assert len(announced) == 3 * flood
-    assert alarm.occurrence == 900
-    assert sum(held_in(c) for c in changes) + len(announced) + alarm.held == 900
-    last = announced[-1].time_ns
-    assert all(c.time_ns <= last + NS_PER_S for c in changes)
-
-
-@pytest.mark.parametrize(
-    ('steps', 'state', 'begun'),
-    [
-        ([], UNACKNOWLEDGED, 0),
-        (['acknowledge'], ACKNOWLEDGED, 0),
-        ([(0.0, 1)], RETURNED, 1),
-        (['shelve', (0.0, 1)], SHELVED, 0),  # latched, it waits below the shelf
-        ([(NAN, 30)], SUPPRESSED, 30),
-    ],
-)
-def test_what_stands_is_told_again_once_a_day(steps, state, begun):
-    settings = {**DARK, 'alarm_shelve_time': 604_800.0}
-    value = {RETURNED: 0.0, SUPPRESSED: NAN}.get(state, 0.0 if (0.0, 1) in steps else 2.0)
-    alarm, told = lived(settings, (2.0, 1), *steps, (value, 2 * DAY_S + 60))
-    first, *again = [c for c in told if c[1].state == state]
-    assert [row for row, _ in again] == [1 + begun + DAY_S, 1 + begun + 2 * DAY_S]
-    for _, change in again:
-        assert (change.state, change.previous, change.occurrence) == (state, state, 1)
-        assert change.raised_ns == told[0][1].raised_ns
-        if state in (SHELVED, SUPPRESSED):
-            assert change.sentence == first[1].sentence
-        else:
-            assert change.sentence.startswith('Active since 20')
-    assert alarm.last == again[-1][1]
-
-
 # --- sentences and state ------------------------------------------------------------------------
 
 
@@ -264,6 +222,7 @@ def test_what_stands_is_told_again_once_a_day(steps, state, begun):
         ([(1.07, 1), 'acknowledge'], r'^Acknowledged; .* 3\.2 MW more'),
         ([(2.0, 1), 'shelve'], r'^Shelved until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; '),
         ([(2.0, 1), (NAN, 30)], r'could not be judged for 0\.5 min'),
+        ([(2.0, 1 + DAY_S)], r'^Active since 20'),
         ([(0.0, 1), (NAN, 30), (0.0, 10)], r'^The alarm can be judged again\.'),
     ],
 )

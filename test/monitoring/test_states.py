@@ -33,7 +33,7 @@ from streams import (
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState
-from valveflow_ros.monitoring.events import FitRequested, JournalKind, ReferenceSet
+from valveflow_ros.monitoring.events import FitRequested, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows, outcome_of
 from valveflow_ros.parameters import TABLE, Depends, Settings
@@ -295,16 +295,6 @@ def test_a_reference_over_an_axis_that_is_no_longer_asked_for_is_let_go():
     assert monitor.predicting == before.characteristic
 
 
-@pytest.mark.parametrize(
-    'changes',
-    [{'main_steam_pressure_unit': 'bar'}, {'unit_tag': 'another'}, {'model_file': 'x.json'}],
-    ids=lambda c: next(iter(c)),
-)
-def test_nothing_of_another_unit_is_used(changes):
-    with pytest.raises(DataError, match='No part of it can be used'):
-        carried(from_bytes(_calm()), changes)
-
-
 # --- another version ------------------------------------------------------------------------
 
 
@@ -339,11 +329,17 @@ def test_inside_a_part_another_version_costs_the_smaller_one():
     assert sentence.count('Discarded') == sentence.count('Discarded: the alarm on its shift.') == 1
 
 
-@pytest.mark.parametrize('lost', [('rows',), ('window', 'force', 'reference')])
-def test_of_what_nothing_can_be_used_says_so(lost):
+@pytest.mark.parametrize(
+    ('lost', 'changes'),
+    [
+        (['rows'], {}), (['window', 'force', 'reference'], {}), ([], {'unit_tag': 'another'}),
+        ([], {'main_steam_pressure_unit': 'bar'}), ([], {'model_file': 'x.json'}),
+    ],
+)  # fmt: skip
+def test_of_what_nothing_can_be_used_or_of_another_unit_says_so(lost, changes):
     saved = {**from_bytes(_calm()), **dict.fromkeys(lost, 'x')}
     with pytest.raises(DataError, match='No part of it can be used'):
-        carried(saved, {})
+        carried(saved, changes)
 
 
 @pytest.mark.parametrize('name', OLD)
@@ -435,20 +431,6 @@ def test_a_reference_of_before_weather_was_known_learns_it_from_the_next_fit():
     feed_rows(other, after(other, 4, 300))
     assert other.reference.curve.residuals.wander_mw > 0.0
     assert other.reference.curve.model_id == before.model_id
-
-
-def test_no_later_reference_brings_the_old_chart_back():
-    """A curve that waits to be the reference was fitted with the old parameters."""
-    soon = WATCHED.changed({'reference_after': 0.003})  # 259 s
-    monitor = Monitor(soon)
-    events = feed_rows(monitor, plant_table(3, N))
-    monitor.reconfigure(soon.changed({'alarm_floor': 20.0, 'refit_period': 100.0}))
-    for seed in range(4, 10):
-        events += feed_rows(monitor, after(monitor, seed, 200))
-        for chart in (monitor.characteristic.residuals.chart, *charts(monitor)):
-            # Half of the floor is not beyond one innovation.
-            assert chart.innovation_mw >= 0.999 * 10.0 * (1.0 - chart.correlation)
-    assert of_type(events, ReferenceSet)
 
 
 def test_no_chart_is_taken_from_a_plant_in_which_something_is_wrong():
