@@ -20,6 +20,7 @@ from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.records import NS_PER_S, SampleTable, Signal
 from valveflow_ros.signals.static_form import integrated_input
+from valveflow_ros.state import from_bytes, to_bytes
 
 START_NS = 1_700_006_400 * NS_PER_S
 INTERPRETED = os.environ.get('NUMBA_DISABLE_JIT', '0') not in ('', '0')
@@ -131,20 +132,16 @@ class Story:
 
 def story(events):
     """Join the predictions of all blocks; keep everything else in its order."""
-    names = ['time_ns', 'u', 'measured_mw', 'static_mw', 'dynamic_mw', 'residual_mw',
-             'average_mw', 'evidence', 'shift_mw', 'state', 'width_mw', 'model_id']  # fmt: skip
-    columns = {name: [] for name in names}
+    columns = {field.name: [] for field in dataclasses.fields(PredictionBlock)}
     others = []
     rows = 0
     for event in events:
         if isinstance(event, PredictionBlock):
             rows += len(event)
-            for name in names:
+            for name, column in columns.items():
                 value = getattr(event, name)
-                if not isinstance(value, np.ndarray):
-                    value = [value] * len(event)
-                columns[name] += [frozen(v) for v in (
-                    value.tolist() if isinstance(value, np.ndarray) else value)]  # fmt: skip
+                many = isinstance(value, np.ndarray)
+                column += map(frozen, value.tolist() if many else [value] * len(event))
         else:
             others.append((None if isinstance(event, AlarmChange) else rows, frozen(event)))
     return Story(columns, others)
@@ -164,6 +161,17 @@ def first_difference(a, b):
     if len(a.others) != len(b.others):
         return f'{len(a.others)} events != {len(b.others)}'
     return ''
+
+
+def column(events, name):
+    """Return a column of all predictions among events."""
+    return np.concatenate([getattr(b, name) for b in of_type(events, PredictionBlock)])
+
+
+def taken_up(made, fresh):
+    """Return a fresh object that goes on where ``made`` is, by way of bytes."""
+    fresh.restore(from_bytes(to_bytes(made.snapshot())))
+    return fresh
 
 
 # A monitor that lives in seconds instead of hours: a few hundred rows hold many fits.
@@ -220,6 +228,13 @@ def plant_table(seed, n, harms=(), start_ns=START_NS, fault_mw=8.0):
                       'nan_temperature': Signal.MAIN_STEAM_TEMPERATURE}[what]  # fmt: skip
             values[rows, signal] = np.nan
     return SampleTable(time_ns, values, np.where(np.isnan(values), 2, 0).astype(np.uint8))
+
+
+def after(monitor, seed, n, harms=(), added_mw=0.0):
+    """Return rows of that plant that follow on the monitor's last one."""
+    table = plant_table(seed, n, harms, start_ns=monitor.last_ns + NS_PER_S)
+    table.values[:, Signal.GENERATED_POWER] += added_mw
+    return table
 
 
 def table_harms(n, most=5):

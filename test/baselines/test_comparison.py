@@ -1,9 +1,10 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison as a whole, on data made by hand."""
+"""The comparison as a whole, on data made by hand; the truth of a plant."""
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 
@@ -14,13 +15,12 @@ from streams import needs_jit
 from valveflow_ros.baselines import comparison
 from valveflow_ros.baselines.comparison import compare, to_json
 from valveflow_ros.baselines.judged import OtherData, part_of
-from valveflow_ros.baselines.truth import read_truth
+from valveflow_ros.baselines.truth import Line, curve_error, read_truth
 from valveflow_ros.curve import characteristic_json
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.records import NS_PER_S, SegmentKind
 
-pytestmark = needs_jit
 REST_S, MOVE_S = 420, 180
 
 
@@ -50,6 +50,7 @@ def halves(plant):
     return part_of(samples, 0, cut), OtherData(other, time_ns, later)
 
 
+@needs_jit
 def test_with_one_block_for_all_loads_hammerstein_is_as_good(plant, curve):
     """The plant is a Hammerstein model, so honest tuning must find it as good as the truth."""
     learn, other = halves(plant)
@@ -80,6 +81,7 @@ def test_with_one_block_for_all_loads_hammerstein_is_as_good(plant, curve):
     )
 
 
+@needs_jit
 def test_without_a_sparse_model_the_rest_is_compared_and_it_says_why(plant, curve, monkeypatch):
     learn, other = halves(plant)
 
@@ -95,6 +97,7 @@ def test_without_a_sparse_model_the_rest_is_compared_and_it_says_why(plant, curv
     assert to_json(found)['methods']['sparse'] == {'failure': 'No model was found.'}
 
 
+@needs_jit
 def test_a_truth_over_another_input_is_refused(plant, curve):
     learn, other = halves(plant)
     truth = read_truth(characteristic_json.to_json(curve(exponent=1.0)))
@@ -102,7 +105,64 @@ def test_a_truth_over_another_input_is_refused(plant, curve):
         compare(learn, curve(), other, truth)
 
 
+@needs_jit
 def test_too_little_to_learn_from_is_refused(plant, curve):
     learn, other = halves(plant)
     with pytest.raises(TooFewSamplesError):
         compare(part_of(learn, 0, 2000), curve(), other)
+
+
+# --- the truth of a plant --------------------------------------------------------------------
+
+RAW = {
+    'pressure_exponent': 1.125,
+    'pieces': [
+        {'u_from': 0.0, 'u_to': 10.0, 'slope': 2.0, 'intercept': 1.0},
+        {'u_from': 10.0, 'u_to': 20.0, 'slope': 1.0, 'intercept': 11.0},
+    ],
+}
+
+
+def test_a_truth_is_read_and_evaluated_and_a_characteristic_is_one_too(curve):
+    c, u = curve(), np.linspace(1000.0, 2200.0, 50)
+    np.testing.assert_allclose(read_truth(characteristic_json.to_json(c))(u), c.model.static(u))
+    truth = read_truth(RAW)
+    np.testing.assert_allclose(truth(np.array([0.0, 5.0, 10.0, 15.0])), [1.0, 11.0, 21.0, 26.0])
+    assert truth.pressure_exponent == 1.125
+
+
+def test_errors_are_those_of_the_curve_and_of_its_parameters():
+    truth = read_truth(RAW)
+    found = curve_error(lambda u: truth(u) + 0.5, truth, 0.0, 20.0)
+    assert (found.rmse_mw, found.largest_mw, found.known) == pytest.approx((0.5, 0.5, 1.0))
+    half = curve_error(lambda u: np.where(u < 10.0, truth(u), np.nan), truth, 0.0, 20.0)
+    assert half.rmse_mw == 0.0
+    assert half.known == pytest.approx(0.5)
+    nothing = curve_error(lambda u: u * np.nan, truth, 0.0, 20.0)
+    assert np.isnan(nothing.rmse_mw)
+    assert nothing.known == 0.0
+    assert np.isnan([found.slope, found.knee, found.intercept]).all()
+    moved = Line(np.array([0.0, 11.5, 20.0]), np.array([2.1, 0.8]), np.array([1.0, 12.0]))
+    off = curve_error(moved, truth, 0.0, 20.0)
+    assert (off.slope, off.knee, off.intercept) == pytest.approx((0.2, 1.5, 1.0))
+    one = curve_error(Line(np.array([0.0, 1.0]), np.ones(1), np.ones(1)), truth, 0.0, 20.0)
+    assert np.isnan([one.slope, one.knee, one.intercept]).all()
+
+
+@pytest.mark.parametrize(
+    ('change', 'sentence'),
+    [
+        (lambda raw: [], "a list 'pieces'"),
+        (lambda raw: {'pieces': []}, "a list 'pieces'"),
+        (lambda raw: {'pieces': [3]}, r"'pieces\[0\]' is not an object"),
+        (lambda raw: raw['pieces'][1].pop('slope') and raw, r"'pieces\[1\].slope' is missing"),
+        (lambda raw: raw['pieces'][0].update(u_to=-1.0) or raw, r"'pieces\[0\].u_to' is not"),
+        (lambda raw: raw['pieces'][1].update(u_from=12.0) or raw, r"'pieces\[1\].u_from' is not"),
+        (lambda raw: raw['pieces'][0].update(slope=True) or raw, r"'pieces\[0\].slope' is"),
+        (lambda raw: raw['pieces'][0].update(slope=float('nan')) or raw, 'is out of range'),
+        (lambda raw: raw | {'pressure_exponent': 'x'}, "'pressure_exponent' is not a number"),
+    ],
+)
+def test_what_is_no_truth_is_refused(change, sentence):
+    with pytest.raises(DataError, match=sentence):
+        read_truth(change(copy.deepcopy(RAW)))

@@ -8,14 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from streams import needs_jit
+from streams import examples, needs_jit
 
 from valveflow_ros.baselines.hammerstein import (
     HammersteinModel,
     fit_hammerstein,
-    grown,
     knots_to_try,
     tangents,
 )
@@ -71,19 +70,20 @@ def inputs(model, seed, n=60):
     return u, usable
 
 
-@settings(max_examples=40, deadline=None)
+@examples(30)
 @given(models(), st.integers(0, 1000))
 def test_the_simulation_is_the_difference_equation(model, seed):
     u, usable = inputs(model, seed)
     answer, settled = model.run(samples(u, u, usable, settle_s=4.0))
     np.testing.assert_allclose(answer, naive_run(model, u, usable), rtol=1e-9, atol=1e-9)
+    assert model.b.sum() == pytest.approx(1.0 + model.denominator.sum(), abs=1e-9)
     ages = np.zeros(len(u), dtype=int)
     for t in range(len(u)):
         ages[t] = (ages[t - 1] if t else 0) + 1 if usable[t] else 0
     assert np.array_equal(settled > 0, ages > 4)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(20)
 @given(models(), st.integers(0, 1000), st.sampled_from([1, 3]))
 def test_tangents_are_the_derivatives_of_the_simulated_means(model, seed, group):
     u, usable = inputs(model, seed)
@@ -109,26 +109,6 @@ def test_tangents_are_the_derivatives_of_the_simulated_means(model, seed, group)
     np.testing.assert_allclose(-residual[weight > 0], means[weight > 0], rtol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
-@given(models(), st.floats(0.0, 1.0))
-def test_at_rest_the_power_is_the_curve(model, share):
-    u = np.full(50, model.knots[0] + share * (model.knots[-1] - model.knots[0]))
-    answer, _ = model.run(samples(u, u))
-    np.testing.assert_allclose(answer, model.static(u), rtol=1e-9)
-    assert model.b.sum() == pytest.approx(1.0 + model.denominator.sum(), abs=1e-9)
-
-
-@settings(max_examples=20, deadline=None)
-@given(models(), st.integers(0, 100))
-def test_a_pole_on_a_zero_changes_nothing(model, seed):
-    u, usable = inputs(model, seed)
-    data = samples(u, u, usable)
-    more = grown(model, len(model.numerator) + 2, len(model.denominator) + 1)
-    assert len(more.denominator) == len(model.denominator) + 1
-    before, after = model.run(data)[0], more.run(data)[0]
-    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
-
-
 def step_response(model, seconds):
     """Return how much of a unit step of the flow the power has followed, shape (n,)."""
     rows = int(np.ceil(seconds.max() / model.step_s)) + model.delay + 2
@@ -138,17 +118,6 @@ def step_response(model, seconds):
     u[0] = 0.0
     answer, _ = flat.run(samples(u, u))
     return np.interp(seconds, np.arange(rows) * model.step_s, answer[1:])
-
-
-def test_the_step_response_of_one_pole_is_an_exponential():
-    pole, delay = 0.9, 3
-    model = HammersteinModel(
-        np.array([0.0, 100.0]), np.array([0.0, 50.0]), np.empty(0), np.array([-pole]), delay, 1.0
-    )
-    seconds = np.arange(40.0)
-    steps = np.maximum(np.arange(40) - delay + 1, 0)
-    np.testing.assert_allclose(step_response(model, seconds), 1.0 - pole**steps, atol=1e-12)
-    np.testing.assert_allclose(model.time_constants_s, [-1.0 / np.log(pole)])
 
 
 def ramps(hours, seed, low=1000.0, high=2000.0):
@@ -188,19 +157,6 @@ def test_a_plant_of_its_own_class_is_found(own_class):
     assert all(1.0 <= mse < 1.1 for *_, mse in fitted.tried)
 
 
-@needs_jit
-def test_scaled_power_scales_the_curve_and_nothing_else(own_class):
-    _, data = own_class
-    short = replace(
-        data, u=data.u[:12000], power_mw=data.power_mw[:12000], usable=data.usable[:12000]
-    )
-    model = fit_hammerstein(short, 2).model
-    doubled = fit_hammerstein(replace(short, power_mw=2.0 * short.power_mw), 2).model
-    np.testing.assert_allclose(doubled.values, 2.0 * model.values, rtol=1e-3)
-    np.testing.assert_allclose(doubled.knots, model.knots, rtol=1e-3)
-    assert doubled.delay == model.delay
-
-
 @pytest.mark.parametrize('pieces', [1, 2, 5])
 @pytest.mark.parametrize('kind', ['even', 'levels', 'one'])
 def test_knots_to_try_rise_whatever_the_input(pieces, kind):
@@ -222,11 +178,9 @@ def test_too_little_data_is_refused_in_a_sentence():
         fit_hammerstein(samples(u, u), 2)
 
 
-@pytest.mark.parametrize(
-    'gaps', [slice(0, None, 200), slice(0, 8400, 200), slice(8400, None, 200)]
-)
+@pytest.mark.parametrize('gaps', [slice(0, 8400, 200), slice(8400, None, 200)])
 def test_gaps_closer_than_the_transient_are_refused(gaps):
-    """All through, in the part to learn from, or in the part to choose by."""
+    """In the part to learn from, or in the part to choose by."""
     rng = np.random.default_rng(5)
     u = rng.uniform(1000.0, 2000.0, 12000)
     usable = np.ones(len(u), dtype=np.uint8)

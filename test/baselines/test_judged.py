@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Scores of predictions on special segments, and who is better than whom."""
+"""Scores of predictions on special segments, who is better than whom, and the tests for it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from streams import needs_jit
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from streams import examples, needs_jit
 
 from valveflow_ros.baselines.comparison import (
     ErrorOrder,
@@ -18,7 +21,7 @@ from valveflow_ros.baselines.comparison import (
     finding_of,
     pairs_on_segments,
 )
-from valveflow_ros.baselines.judged import judge, trial_of
+from valveflow_ros.baselines.judged import judge, over_blocks, over_samples, trial_of, widening_of
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.report.comparison_tables import pairs_table
@@ -52,31 +55,6 @@ def test_scores_are_those_of_obvious_loops(curve, data):
     assert found.bias('a').mean == pytest.approx(-0.3, abs=0.05)
 
 
-def test_white_noise_is_worth_each_sample(curve, data):
-    trial = trial_of(data(), curve())
-    found = judge(trial, {'a': curve().model.static(trial.u)})
-    assert 1.0 <= found.widening < 1.6
-    stands, tested = found.passed('a', as_paper=True)
-    assert tested == 30
-    assert stands >= 25
-
-
-def test_rows_nobody_can_judge_are_left_out_and_counted(curve, data):
-    other = data()
-    samples = other.samples
-    usable = samples.usable.copy()
-    usable[600] = 0  # in the second segment
-    trial = trial_of(replace(other, samples=replace(samples, usable=usable)), curve())
-    assert not trial.good[600]
-    assert not trial.good[601:621].any()
-    assert trial.good[621]
-    assert not trial.good[:20].any()
-    low = replace(curve(), pieces=curve().pieces[:2], breakpoint_intervals=((0.0, 1.0),))
-    narrow = judge(trial_of(other, low), {'a': curve().model.static(samples.u)})
-    assert narrow.outside > 0
-    assert all(samples.u[s.rows].max() <= 1800.0 for s in narrow.segments)
-
-
 def test_data_beyond_the_curve_are_refused_with_their_range(curve, data):
     trial = trial_of(data(u_shift=5000.0), curve())
     with pytest.raises(DataError, match=r'their u lies from 60\d\d to 71\d\d'):
@@ -100,11 +78,7 @@ def predictions(trial, curve, hammerstein_mw, sparse_mw, rng):
 
 @pytest.mark.parametrize(
     ('hammerstein', 'sparse', 'finding'),
-    [
-        (2.0, 3.0, Finding.CONFIRMED),
-        (0.0, 3.0, Finding.OPEN),
-        (0.0, 0.0, Finding.OPEN),
-    ],
+    [(2.0, 3.0, Finding.CONFIRMED), (0.0, 3.0, Finding.OPEN), (0.0, 0.0, Finding.OPEN)],
 )
 def test_what_becomes_of_the_finding(curve, data, hammerstein, sparse, finding):
     trial = trial_of(data(), curve())
@@ -167,12 +141,74 @@ def test_one_segment_without_an_answer_decides_nothing(curve, data):
     assert next(p for p in rows if p.baseline == 'sparse').outcome is ErrorOrder.OPEN
 
 
-def test_without_dynamics_there_is_nothing_to_simulate(curve, data):
-    trial = trial_of(data(), curve())
-    made = predictions(trial, curve, 1.0, 1.0, np.random.default_rng(3))
-    del made['proposed.dynamic']
-    mse, rows = everywhere(trial, made)
-    assert rows == ()
-    assert set(mse) == {'hammerstein.dynamic', 'sparse.dynamic'}
-    pairs = pairs_on_segments(judge(trial, made), made)
-    assert Terms.DYNAMIC not in {p.terms for p in pairs}
+# --- tests of a mean difference ------------------------------------------------------------
+
+
+def ar1(n, phi, rng):
+    e = rng.standard_normal(n + 200)
+    for t in range(1, len(e)):
+        e[t] += phi * e[t - 1]
+    return e[200:]
+
+
+@examples(40)
+@given(st.integers(0, 10_000), st.integers(2, 60), st.floats(-2.0, 2.0))
+def test_counting_each_sample_is_the_textbooks_paired_test(seed, n, shift):
+    rng = np.random.default_rng(seed)
+    y, predicted = rng.normal(shift, 1.0, n), rng.normal(0.0, 1.0, n)
+    ours, theirs = over_samples(y - predicted), stats.ttest_rel(y, predicted)
+    assert ours.t == pytest.approx(theirs.statistic, rel=1e-9)
+    assert ours.p_value == pytest.approx(theirs.pvalue, rel=1e-6, abs=1e-12)
+    low, high = ours.interval()
+    wanted = theirs.confidence_interval(0.95)
+    np.testing.assert_allclose([low, high], [wanted.low, wanted.high], rtol=1e-8)
+
+
+def test_correlated_noise_fools_the_one_and_not_the_other():
+    """Under the null, a zero mean is rejected ever so often at 5 %."""
+    rng = np.random.default_rng(12)
+    naive = counted = 0
+    for _ in range(150):
+        segments = [ar1(400, 0.97, rng) for _ in range(12)]
+        edges = np.arange(13) * 400
+        spans = np.column_stack([edges[:-1], edges[1:]])
+        widening = widening_of(np.concatenate(segments), spans, 1.0)
+        naive += over_samples(segments[0]).zero_is_rejected()
+        counted += over_samples(segments[0], widening).zero_is_rejected()
+    assert naive > 100
+    # A dozen short segments teach the correlation roughly; 5 % becomes 5 to 15 %.
+    assert counted < 23
+
+
+@pytest.mark.parametrize('phi', [0.0, 0.95])
+def test_the_widening_of_a_known_noise(phi):
+    rng = np.random.default_rng(15)
+    edges = np.arange(101) * 600
+    spans = np.column_stack([edges[:-1], edges[1:]])
+    found = widening_of(ar1(60_000, phi, rng), spans, 1.0)
+    assert found == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.3)
+
+
+def test_what_cannot_be_tested_says_so():
+    for difference, widening in ((np.array([1.0]), 1.0), (np.arange(5.0), 4.0), (np.empty(0), 1)):
+        test = over_samples(difference, widening)
+        assert np.isnan(test.p_value)
+        assert not test.zero_is_rejected()
+        assert np.isnan(test.interval()).all()
+    assert np.isnan(over_blocks(np.array([3.0])).p_value)
+    assert np.isnan(over_blocks(np.empty(0)).mean)
+    # No scatter at all.
+    same = over_samples(np.full(10, 2.0))
+    assert (same.p_value, same.t) == (0.0, np.inf)
+    assert over_samples(np.zeros(10)).p_value == 1.0
+
+
+@examples(30)
+@given(st.integers(0, 1000), st.floats(0.1, 50.0))
+def test_scaling_changes_no_verdict(seed, scale):
+    values = np.random.default_rng(seed).normal(0.3, 1.0, 40)
+    for test in (over_samples, over_blocks):
+        a, b = test(values), test(scale * values)
+        assert b.t == pytest.approx(a.t, rel=1e-6)
+        assert b.mean == pytest.approx(scale * a.mean, rel=1e-6)
+        assert test(-values).t == pytest.approx(-a.t, rel=1e-9)

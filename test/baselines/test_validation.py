@@ -31,6 +31,10 @@ def test_a_shift_is_found_with_its_sign_and_size(curve, data):
     assert found.overall.test.mean == pytest.approx(3.0, abs=0.1)
     assert found.overall.low_mw < 3.0 < found.overall.high_mw + 0.1
     assert validate(curve(shift_mw=-3.0), data(), 5.0).verdict is Verdict.HOLDS
+    assert validate(curve(), data(noise_mw=20.0), 0.5).verdict is Verdict.OPEN
+    moving = validate(curve(dynamics=True), data(), 1.0)
+    assert (moving.judged_by, moving.verdict) == ('simulated', Verdict.HOLDS)
+    assert set(moving.predictions) == {'curve', 'simulated'}
 
 
 def test_a_shift_of_one_piece_is_found_on_it(curve, data):
@@ -39,17 +43,6 @@ def test_a_shift_of_one_piece_is_found_on_it(curve, data):
     means = [c.test.mean for c in found.pieces]
     assert means[2] == pytest.approx(-4.0, abs=0.2)
     assert np.abs(means[:2]).max() < 0.2
-
-
-def test_noise_too_large_for_the_tolerance_leaves_it_open(curve, data):
-    assert validate(curve(), data(noise_mw=20.0), 0.5).verdict is Verdict.OPEN
-
-
-def test_dynamics_are_judged_where_they_are_known(curve, data):
-    found = validate(curve(dynamics=True), data(), 1.0)
-    assert found.judged_by == 'simulated'
-    assert set(found.predictions) == {'curve', 'simulated'}
-    assert found.verdict is Verdict.HOLDS
 
 
 def test_the_better_of_two_is_told(curve, data):

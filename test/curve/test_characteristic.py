@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import examples
 
-from valveflow_ros.curve.characteristic import Choice, FittedData, FormEvidence
+from valveflow_ros.curve.characteristic import FormEvidence
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 
@@ -87,39 +87,8 @@ def test_the_inverse_at_the_ends_and_in_a_jump(slopes, jump, inverse):
     got = c.inverse(np.array(list(inverse)))
     assert got == pytest.approx(list(inverse.values()), abs=0.0, nan_ok=True)
     assert c.values()[1] == 10.0 + jump / 2.0
-
-
-@pytest.mark.parametrize('slope', [0.0, -0.01, -1.0])
-@pytest.mark.parametrize('place', [0, 1, 2])
-def test_a_piece_that_does_not_rise_is_named_and_the_inverse_refused(slope, place):
-    slopes = [0.2, 0.3, 0.1]
-    slopes[place] = slope
-    with pytest.raises(DataError) as caught:
-        curve([0.0, 100.0, 200.0, 300.0], slopes).inverse(np.array([10.0]))
-    assert f'piece {place + 1}' in str(caught.value)
-    assert 'no inverse' in str(caught.value)
-
-
-def test_the_model_has_the_numbers_of_the_pieces():
-    c = curve([1050.0, 1250.0, 1600.0], [0.24, 0.18], [1.5], 150.0, dynamics=DYNAMICS)
-    m = c.model
-    assert m.knots.tolist() == c.breakpoints.tolist() == [1050.0, 1250.0, 1600.0]
-    assert m.slopes() == pytest.approx([0.24, 0.18])
-    assert m.intercepts() == pytest.approx([p.intercept for p in c.pieces])
-    assert m.levels.tolist() == [240.0]
-    assert m.time_constants.tolist() == [10.0, 80.0]
-    assert m.delays.tolist() == [3.0, 10.0]
-
-
-@pytest.mark.parametrize('dtype', [np.float32, np.int64, np.float64])
-def test_other_arrays_are_taken_too(dtype):
-    c = curve([0.0, 10.0, 20.0], [1.0, 2.0])
-    u = np.array([1, 5, 15], dtype=dtype)
-    u.setflags(write=False)
-    assert c(u).tolist() == [1.0, 5.0, 20.0]
-    assert c(np.array(5.0)) == 5.0
-    assert c(np.empty(0)).shape == (0,)
-    assert c.inverse(np.empty(0)).shape == (0,)
+    with pytest.raises(DataError, match='no inverse: piece 2 does not rise'):
+        curve([0.0, 10.0, 20.0], [1.0, -0.01]).inverse(np.array([10.0]))
 
 
 # --- the id ---------------------------------------------------------------------------------
@@ -155,15 +124,6 @@ def test_json_and_back_is_the_same_to_the_last_bit(c, dynamic):
     back = through_json(c)
     assert repr(back) == repr(c)  # NaN equals NaN in its repr
     assert back.with_id().model_id == c.model_id
-
-
-@pytest.mark.parametrize('value', [NAN, INF, -INF])
-def test_numbers_that_json_does_not_have_become_absent(value):
-    c = curve([0.0, 1.0], [1.0], choice=Choice('paper', {1: value}, {1: value}),
-              source=FittedData(0, 1, 2, 3, 4, value, value, False))  # fmt: skip
-    back = through_json(c)
-    assert math.isnan(back.choice.cost[1])
-    assert math.isnan(back.source.temperature_mean_degc)
 
 
 def test_the_contracts_keys_are_there():
@@ -247,46 +207,23 @@ def test_any_value_absent_or_nonsense_is_read_or_refused_with_a_sentence(value):
 @pytest.mark.parametrize(
     ('path', 'value'),
     [
-        (('pieces',), []),
-        (('pieces', 0, 'samples'), INF),
-        (('pieces', 0, 'samples'), -3),
-        (('pieces', 0, 'slope'), None),
-        (('pieces', 0, 'slope'), '1.5'),
-        (('pieces', 1, 'u_from'), 12.0),
-        (('pieces', 1, 'u_to'), 10.0),
-        (('pieces', 1, 'slope_stderr'), -0.1),
-        (('dynamics', 0, 'time_constant_s'), 0),
-        (('dynamics', 0, 'time_constant_s'), -1.0),
-        (('dynamics', 0, 'delay_s'), NAN),
-        (('dynamics', 0, 'delay_s'), -1.0),
-        (('dynamics', 0, 'delay_s'), 1e9),
-        (('dynamics', 1, 'power_to'), 200.0),
-        (('pressure_exponent',), NAN),
-        (('pressure_exponent',), -3.0),
-        (('residuals', 'average_sd_mw'), -1.0),
-        (('residuals', 'average_sd_mw'), INF),
-        (('breakpoint_intervals',), []),
-        (('breakpoint_intervals', 0), [1.0]),
-        (('selection', 'cost'), {'x': 1.0}),
-        (('temperature', 'flag'), 'false'),
-        (('notes',), 'abc'),
-        (('window', 'start_ns'), INF),
-        (('window', 'start_ns'), 1e300),
-        (('version',), 3),
-        (('version',), True),
-        (('format',), 'valveflow/diagnosis'),
+        (('pieces',), []), (('pieces', 0, 'samples'), INF), (('pieces', 0, 'slope'), '1.5'),
+        (('pieces', 1, 'u_from'), 12.0), (('pieces', 1, 'u_to'), 10.0),
+        (('pieces', 1, 'slope_stderr'), -0.1), (('dynamics', 0, 'time_constant_s'), 0),
+        (('dynamics', 0, 'delay_s'), NAN), (('dynamics', 0, 'delay_s'), 1e9),
+        (('dynamics', 1, 'power_to'), 200.0), (('dynamics', 1, 'power_from'), 250.0),
+        (('pressure_exponent',), -3.0), (('residuals', 'average_sd_mw'), INF),
+        (('breakpoint_intervals',), []), (('breakpoint_intervals', 0), [1.0]),
+        (('breakpoint_intervals', 0), [11.0, 12.0]), (('selection', 'cost'), {'x': 1.0}),
+        (('temperature', 'flag'), 'false'), (('notes',), 'abc'), (('window', 'start_ns'), 1e300),
+        (('window', 'end_ns'), 1), (('version',), 3), (('version',), True),
+        (('format',), 'valveflow/diagnosis'), (('axis',), 'pressure'),
     ],
 )  # fmt: skip
 def test_what_no_plant_has_is_refused_and_the_place_named(path, value):
     with pytest.raises(DataError) as caught:
         from_json(changed(path, value))
     assert str(path[-1]) in str(caught.value) or str(path[0]) in str(caught.value)
-
-
-@pytest.mark.parametrize('raw', [None, [], 'x', 3, {}, {'format': 'valveflow/characteristic'}])
-def test_what_is_no_characteristic_at_all_is_refused(raw):
-    with pytest.raises(DataError):
-        from_json(raw)
 
 
 # --- knees at fixed openings ----------------------------------------------------------------
@@ -307,21 +244,13 @@ def test_the_power_is_the_curves_at_the_opening_times_the_pressure(exponent, off
     c = choked(exponent, offset)
     expected = p**exponent * naive_value(c, v) + offset
     assert float(c.power(v, p)) == pytest.approx(expected, nan_ok=True)
+    assert c.values() == pytest.approx(c.power(c.breakpoints, 13.0))
     there = c.at_pressure(p)
     assert float(there(np.array(v))) == pytest.approx(expected, nan_ok=True)
     assert float(there.power(v, 1.7)) == pytest.approx(expected, nan_ok=True)
     if math.isfinite(expected):
         assert float(c.opening(expected, p)) == pytest.approx(v, abs=1e-6)
         assert math.isnan(c.opening(expected + 5000.0, p))
-
-
-def test_what_is_shown_is_at_the_reference_pressure():
-    c = choked()
-    assert c.values() == pytest.approx(c.power(c.breakpoints, 13.0))
-    assert c(c.breakpoints) == pytest.approx(c.values())
-    assert c.inverse(c.values()[1:3]) == pytest.approx(c.breakpoints[1:3])
-    assert curve([0.0, 9.0], [2.0]).at_pressure(5.0) == curve([0.0, 9.0], [2.0])
-    assert choked(1.05).with_id().model_id != choked(1.06).with_id().model_id
 
 
 @pytest.mark.parametrize('form', [None, FormEvidence(
@@ -344,21 +273,9 @@ def test_the_form_survives_json(form):
     assert np.isfinite(theirs.values()).all()
 
 
-def test_a_file_of_version_1_is_a_curve_of_the_integrated_input():
-    raw = {
-        k: v
-        for k, v in GOOD.items()
-        if k not in ('axis', 'pressure_scale_exponent', 'offset_mw', 'reference_pressure_mpa')
-    }
-    back = from_json({**raw, 'version': 1})
-    assert back.axis == 'integrated_input'
-    assert back(np.array([5.0])) == from_json(GOOD)(np.array([5.0]))
-
-
 @pytest.mark.parametrize(
     ('change', 'what'),
     [
-        ({'axis': 'pressure'}, 'axis'),
         ({'axis': 'opening'}, 'pressure_scale_exponent'),
         ({'offset_mw': 3.0}, 'offset_mw'),
         ({'pressure_scale_exponent': 1.0}, 'pressure_scale_exponent'),

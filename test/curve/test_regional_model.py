@@ -45,12 +45,6 @@ def test_packing_and_unpacking_gives_the_same_model(model):
     assert (back.pieces, back.regions) == (model.pieces, model.regions)
 
 
-def test_without_data_there_is_no_flow():
-    model = RegionalModel(*(np.array(a) for a in ([0.0, 1.0], [0.0], [1.0], [], [], [])))
-    assert np.isnan(model.static(np.array([np.nan]))).all()
-    assert model.regions == 0
-
-
 # --- the response ---------------------------------------------------------------------------
 
 
@@ -90,14 +84,3 @@ def test_a_ramp_is_answered_late_by_time_constant_and_delay_at_any_period(step, 
     settled = time_s > 40.0 * time_constant + delay
     assert settled.any()
     assert got[settled] == pytest.approx(late[settled], rel=1e-9)
-
-
-def test_a_step_is_answered_after_the_delay_with_the_time_constant():
-    """Between two rows the flow runs straight, so a step takes one row to be there."""
-    u = np.where(np.arange(200) < 50, 20.0, 60.0)
-    got, _ = one_region(10.0, 3.0).respond(u, np.ones(200, dtype=np.uint8), 1.0, 0.0)
-    after = np.arange(147)
-    first = 1.0 - 10.0 * (1.0 - np.exp(-0.1))
-    expected = 1.0 - (1.0 - first) * np.exp(-after / 10.0)
-    assert got[:53] == pytest.approx(20.0)
-    assert got[53:] == pytest.approx(20.0 + 40.0 * expected, rel=1e-12)

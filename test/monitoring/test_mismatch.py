@@ -176,7 +176,7 @@ def test_any_cutting_gives_the_same_scores_bit_for_bit(seed, gaps, data):
 
 
 @needs_jit
-@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('seed', range(3))
 def test_correlated_noise_is_silence(seed):
     stream, made = Stream(seed, 10.0), Mismatch(STEP_S)
     loudest = 0.0
@@ -233,16 +233,14 @@ def test_a_misfit_that_has_gone_is_forgotten():
     assert abs(made.judge().score) < 0.7 * LIMIT
 
 
+@needs_jit
 def test_what_cannot_be_judged_is_silence():
     stream = Stream(13, 0.3)
     assert Mismatch(STEP_S).judge() == NOTHING
     assert watched(stream).judge() == NOTHING
     stream.residual[:] = math.nan
     assert watched(stream).judge() == NOTHING
-
-
-@needs_jit
-def test_extreme_numbers_leave_no_nan_behind():
+    # Extreme numbers leave no NaN behind.
     stream = Stream(14, 2.0)
     stream.residual[::7] = 1e150
     stream.u[::5], stream.static[::5] = 0.0, 0.0

@@ -1,25 +1,20 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The reference of a running monitor: decision, journal, judgement and alarm."""
+"""The curve of health: set by hand or by itself, follows wear, never learns a fault; its alarm."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from alarm_story import judgement
-from streams import (
-    QUICK_MONITOR,
-    START_NS,
-    grid_ns,
-    lagged,
-    of_type,
-    steps_and_ramps,
-    table_of,
-)
+from curves import curve
+from streams import QUICK_MONITOR, START_NS, after, of_type, plant_table, taken_up
 
+from valveflow_ros.curve.characteristic import FittedData, RegionDynamics
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import AlarmAction
@@ -31,139 +26,161 @@ from valveflow_ros.monitoring.events import (
     JournalKind,
     ReferenceSet,
 )
-from valveflow_ros.monitoring.monitor import Monitor
+from valveflow_ros.monitoring.monitor import BY_ITSELF, Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, JournalReplayer, feed_rows
+from valveflow_ros.monitoring.reference import MONTH_NS, ReferenceCurve
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import NS_PER_S
-from valveflow_ros.signals.static_form import StaticForm
+from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
+from valveflow_ros.state import from_bytes, to_bytes
 
 # The residual alarm is out of the way: it would stop refits before the curve can move.
-SETTINGS = Settings({**QUICK_MONITOR, 'alarm_limit': 1000.0, 'shift_confidence': 0.99})
+BY_HAND = Settings({**QUICK_MONITOR, 'alarm_limit': 1000.0, 'shift_confidence': 0.99})
+BY_TIME = Settings({**QUICK_MONITOR, 'reference_after': 0.01, 'alarm_off_delay': 600.0})
 NORMAL, UNACKNOWLEDGED, _, RETURNED, *_ = AlarmState
-N = 700
+N = 3000
 
 
-def plant(seed, n, lost_mw=0.0, start_ns=START_NS):
-    """Return rows of a small plant that gives so many MW less than it should."""
-    rng = np.random.default_rng(seed)
-    u = steps_and_ramps(rng, n, hold=(30, 90))
-    power = lagged(20.0 + 0.1 * u, 2.0, 1.0) - lost_mw + 0.15 * rng.normal(0.0, 1.0, n)
-    return table_of(grid_ns(n, start_ns=start_ns), u + 0.5 * rng.normal(0.0, 1.0, n), power)
-
-
-def following(monitor, seed, n, lost_mw=0.0):
-    return plant(seed, n, lost_mw, monitor.last_ns + NS_PER_S)
+@cache
+def _run(settings, rows):
+    monitor = Monitor(settings)
+    return monitor, feed_rows(monitor, plant_table(1, rows))
 
 
 def with_curve():
-    monitor = Monitor(SETTINGS)
-    feed_rows(monitor, plant(1, N))
-    assert monitor.characteristic is not None
-    return monitor
+    return taken_up(_run(BY_HAND, 700)[0], Monitor(BY_HAND))
 
 
-def changes_of(events):
-    return [e for e in of_type(events, AlarmChange) if e.name == ShiftAlarm.NAME]
+def healthy():
+    """Return a monitor that has made a reference by itself."""
+    return taken_up(_run(BY_TIME, N)[0], Monitor(BY_TIME))
 
 
-# --- the decision -----------------------------------------------------------------------------
+def named(events, name):
+    return [e for e in of_type(events, AlarmChange) if e.name == name]
 
 
-def test_without_a_curve_there_is_nothing_to_set():
-    monitor = Monitor(SETTINGS)
-    with pytest.raises(DataError, match=r'could become the reference\. No curve yet'):
-        monitor.set_reference()
-    assert monitor.reference.curve is None
+# --- by hand ----------------------------------------------------------------------------------
 
 
-def test_setting_it_is_told_and_journalled():
+def test_setting_it_is_told_and_journalled_and_a_given_one_stands_there_whole():
     monitor = with_curve()
-    told, entry = monitor.set_reference()
     curve = monitor.characteristic
+    told, entry = monitor.set_reference()
     assert told == ReferenceSet(curve)
     assert entry == JournalEntry(
         monitor.last_ns, JournalKind.SET_REFERENCE, 0, monitor.rows, curve.model_id, ''
     )
     assert monitor.reference.curve is curve
+    _, entry = Monitor(BY_HAND).set_reference(curve)
+    assert to_json(from_json(json.loads(entry.text))) == to_json(curve)
+    broken = replace(entry, text='{"format": 1')
+    with pytest.raises(DataError, match='change of reference cannot be read'):
+        JournalReplayer(Monitor(BY_HAND), [broken]).feed(plant_table(1, 5))
 
 
-def test_one_that_is_given_stands_in_the_journal_whole():
-    curve = with_curve().characteristic
-    fresh = Monitor(SETTINGS)
-    _, entry = fresh.set_reference(curve)
-    again = from_json(json.loads(entry.text))
-    assert to_json(again) == to_json(curve)
-    assert entry.rows == 0
-
-
-def test_fits_get_the_form_of_a_reference_with_another_exponent():
+def test_a_plant_that_stays_is_judged_by_every_later_curve_and_raises_no_alarm():
     monitor = with_curve()
-    other = replace(monitor.characteristic, pressure_exponent=1.0)
-    monitor.set_reference(other)
-    (task,) = (e.task for e in monitor.request_fit() if isinstance(e, FitRequested))
-    assert task.form == StaticForm(exponent=1.0)
-
-
-def test_every_later_curve_is_judged_and_none_before():
-    monitor = with_curve()
-    before = feed_rows(monitor, following(monitor, 2, N))
-    assert of_type(before, CurveAdopted)
-    assert all(e.shift is None for e in of_type(before, CurveAdopted))
+    before = of_type(feed_rows(monitor, after(monitor, 2, 700)), CurveAdopted)
+    assert before
+    assert all(e.shift is None for e in before)
     monitor.set_reference()
-    after = of_type(feed_rows(monitor, following(monitor, 3, N)), CurveAdopted)
-    assert after
-    for event in after:
+    events = feed_rows(monitor, after(monitor, 3, 2800))
+    assert of_type(events, CurveAdopted)
+    for event in of_type(events, CurveAdopted):
         assert event.shift.model_id == event.characteristic.model_id
         assert event.shift.reference_id == monitor.reference.curve.model_id
         assert len(event.shift.pieces) == len(event.characteristic.pieces)
-
-
-def test_a_clock_that_goes_back_takes_neither_reference_nor_alarm():
-    monitor = with_curve()
-    monitor.set_reference()
-    feed_rows(monitor, following(monitor, 4, 4 * N, 4.0))
-    assert monitor.reference.alarm.active
-    monitor.restart(CLOCK_BACK)
-    assert monitor.reference.curve is not None
-    assert monitor.reference.alarm.state == UNACKNOWLEDGED
-    events = feed_rows(monitor, plant(5, N, 4.0))
-    assert any(e.shift is not None for e in of_type(events, CurveAdopted))
-
-
-# --- the alarm --------------------------------------------------------------------------------
+    assert not named(events, 'curve_shift')
 
 
 def test_a_plant_that_moved_raises_the_alarm_once_and_it_can_be_acknowledged():
     monitor = with_curve()
     monitor.set_reference()
-    events = feed_rows(monitor, following(monitor, 4, 4 * N, 4.0))
-    (change,) = changes_of(events)
+    events = feed_rows(monitor, after(monitor, 4, 2800, added_mw=-4.0))
+    (change,) = named(events, 'curve_shift')
     assert (change.state, change.previous) == (UNACKNOWLEDGED, NORMAL)
-    assert change.value < -SETTINGS.real('shift_least')
+    assert change.value < -BY_HAND.real('shift_least')
     assert change.unit == 'MW'
     assert 'less than the reference of 2023-11-15' in change.sentence
+    # A clock that goes back takes neither reference nor alarm.
+    other = taken_up(monitor, Monitor(BY_HAND))
+    other.restart(CLOCK_BACK)
+    assert other.reference.alarm.state == UNACKNOWLEDGED
+    later = plant_table(5, 700)
+    assert any(e.shift is not None for e in of_type(feed_rows(other, later), CurveAdopted))
     acknowledged, entry = monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
-    assert acknowledged.state == AlarmState.ACKNOWLEDGED
-    assert acknowledged.name == 'curve_shift'
+    assert (acknowledged.name, acknowledged.state) == ('curve_shift', AlarmState.ACKNOWLEDGED)
     assert entry.kind == JournalKind.ACKNOWLEDGE
-    with pytest.raises(DataError, match='no alarm to acknowledge'):
-        monitor.operate_alarms(AlarmAction.ACKNOWLEDGE)
     # The moved plant is accepted: its curve is the reference now.
-    ended = changes_of(monitor.set_reference())
-    assert [c.state for c in ended] == [NORMAL]
+    assert [c.state for c in named(monitor.set_reference(), 'curve_shift')] == [NORMAL]
     assert not monitor.reference.alarm.standing
 
 
-def test_a_plant_that_stays_raises_none():
+def test_a_curve_that_cannot_be_compared_says_why():
     monitor = with_curve()
-    feed_rows(monitor, following(monitor, 2, N))
-    monitor.set_reference()
-    assert not changes_of(feed_rows(monitor, following(monitor, 6, 4 * N)))
+    pieces = tuple(replace(p, u_from=p.u_from + 9e3, u_to=p.u_to + 9e3)
+                   for p in monitor.characteristic.pieces)  # fmt: skip
+    monitor.set_reference(replace(monitor.characteristic, pieces=pieces))
+    events = feed_rows(monitor, after(monitor, 3, 700))
+    assert all(e.shift is None for e in of_type(events, CurveAdopted))
+    assert 'nothing can be compared' in monitor.reference.problem
 
+
+# --- by itself --------------------------------------------------------------------------------
+
+
+def test_a_curve_becomes_the_reference_by_itself_unless_that_is_left_to_the_operator():
+    monitor, events = _run(BY_TIME, N)
+    (told, *_) = of_type(events, ReferenceSet)
+    assert told.characteristic in [e.characteristic for e in of_type(events, CurveAdopted)]
+    assert monitor.predicting is monitor.reference.curve
+    assert any(getattr(e, 'text', '') == BY_ITSELF for e in events)
+    monitor, events = _run(BY_TIME.changed({'reference_after': 0.0}), N)
+    assert of_type(events, CurveAdopted)
+    assert not of_type(events, ReferenceSet)
+    assert monitor.reference.curve is None
+
+
+@pytest.mark.parametrize('added_mw', [-8.0, 6.0])
+def test_a_fault_that_stays_stands_however_long_it_lasts(added_mw):
+    """Longer than the window, over many fits and over a restart of the monitor."""
+    monitor = healthy()
+    reference, began_ns = monitor.reference.curve, monitor.last_ns
+    events = feed_rows(monitor, after(monitor, 2, N, added_mw=added_mw))
+    monitor = taken_up(monitor, Monitor(BY_TIME))
+    events += feed_rows(monitor, after(monitor, 3, N, added_mw=added_mw))
+    assert (monitor.alarm.active, monitor.alarm.occurrence) == (True, 1)
+    assert monitor.reference.curve.model_id == reference.model_id == monitor.predicting.model_id
+    raised_ns = named(events, 'residual')[0].time_ns
+    fits = [e.task for e in of_type(events, FitRequested) if e.task.request_ns > raised_ns]
+    assert fits
+    # A block of the alarm is what its onset may be late or early by.
+    assert all(task.contents.time_ns[0] > began_ns - 60 * NS_PER_S for task in fits)
+    assert middle_of(monitor) - middle_of(healthy()) == pytest.approx(added_mw, abs=1.0)
+
+
+def middle_of(monitor):
+    at = np.array([float(np.median(healthy().reference.curve.breakpoints))])
+    return monitor.characteristic.model.static(at)[0]
+
+
+def test_a_state_of_before_goes_on():
+    """States of earlier versions have neither regime nor a curve of its own that predicts."""
+    state = from_bytes(to_bytes(healthy().snapshot()))
+    for key in ('times_ns', 'fault_ns', 'first', 'candidate', 'worn'):
+        del state['reference'][key]
+    alarm = state['alarm']
+    del state['force']['predicting'], alarm['span'], alarm['onset_ns']
+    alarm['memory'] = alarm['memory'][:-1]
+    monitor = Monitor(BY_TIME)
+    monitor.restore(state)
+    assert monitor.predicting is not None
+    feed_rows(monitor, after(monitor, 4, 300))
+
+
+# --- the alarm on a shift ---------------------------------------------------------------------
 
 STRICT = Settings({'shift_confidence': 0.999, 'shift_least': 0.3, 'alarm_dead_band': 0.3})
-
-
 LOOSE = STRICT.changed({'alarm_latch': False})
 CALM = (0.0, 1.0)  # moved by so many MW, with this chance that it did not
 
@@ -176,6 +193,11 @@ def told(alarm, *shifts, settings=STRICT, begin_s=0, every_s=600):
     ]  # fmt: skip
 
 
+def at(shift, u_from, u_to):
+    """Return the judgement as one of another piece."""
+    return replace(shift, pieces=(replace(shift.pieces[0], u_from=u_from, u_to=u_to),))
+
+
 @pytest.mark.parametrize(
     ('settings', 'shifts', 'states'),
     [
@@ -186,6 +208,11 @@ def told(alarm, *shifts, settings=STRICT, begin_s=0, every_s=600):
         (STRICT, [(2.0, 5e-3), (0.25,)], []),
         (STRICT, [(2.0,), (2.0, 5e-3), (0.25,)], [UNACKNOWLEDGED]),
         (STRICT, [(2.0,), (2.0, 2e-2)], [UNACKNOWLEDGED, RETURNED]),
+        # A small one has to be seen by two curves in a row, at the same place, to the same side.
+        (STRICT, [(0.6,), (0.7,), (0.6,)], [UNACKNOWLEDGED]),
+        (STRICT, [(0.6,), CALM, (0.6,)], []),
+        (STRICT, [(0.6,), (-0.6,), (0.6,)], []),
+        (STRICT, [(0.6,), at(judgement(0.6), 1150.0, 2280.0)], []),
     ],
 )  # fmt: skip
 def test_its_states_are_those_of_the_standard(settings, shifts, states):
@@ -196,68 +223,36 @@ def test_its_states_are_those_of_the_standard(settings, shifts, states):
     _, changes = alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'now')
     assert len(changes) == (bool(states) and states[-1] != NORMAL)
     for change in changes:
-        assert change.sentence.endswith('MW.')
         assert change.sentence.startswith('Acknowledged. ')
+        assert change.sentence.endswith('MW.')
         assert (change.occurrence, change.limit) == (count, 0.4)
     assert alarm.operate(AlarmAction.ACKNOWLEDGE, START_NS, 'now')[1] == []
 
 
-def at(shift, u_from, u_to):
-    """Return the judgement as one of another piece."""
-    return replace(shift, pieces=(replace(shift.pieces[0], u_from=u_from, u_to=u_to),))
-
-
-@pytest.mark.parametrize(
-    ('shifts', 'states'),
-    [
-        ([(0.6,), (0.7,), (0.6,)], [UNACKNOWLEDGED]),
-        ([(0.6,), CALM, (0.6,)], []),
-        ([(0.6,), (-0.6,), (0.6,)], []),
-        ([(0.6,), at(judgement(0.6), 1600.0, 2280.0)], []),
-        ([(0.6,), at(judgement(0.6), 1150.0, 2280.0)], []),
-        ([(-0.9,)], [UNACKNOWLEDGED]),
-    ],
-)
-def test_a_small_shift_has_to_be_seen_by_two_curves_in_a_row(shifts, states):
-    alarm = ShiftAlarm()
-    assert told(alarm, *shifts) == states
-    assert bool(alarm.ranges) == bool(states)
-
-
-def test_what_was_seen_against_another_reference_confirms_nothing():
+def test_what_confirms_is_of_this_reference_and_of_another_time():
     alarm = ShiftAlarm()
     assert told(alarm, (0.6,)) == []
     assert alarm.reset('There is a new reference.', START_NS, 'now', STRICT) == []
     assert told(alarm, (0.7,), begin_s=600) == []
-
-
-def test_curves_asked_for_one_after_another_are_one_judgement():
-    alarm = ShiftAlarm()
-    assert told(alarm, (0.6,), (0.6,), (0.6,), every_s=60) == []
-    assert told(alarm, (0.6,), begin_s=600) == [UNACKNOWLEDGED]
-    calm = ShiftAlarm()
-    assert told(calm, CALM, (0.6,), (0.6,), every_s=60) == []
-    assert told(calm, (0.6,), begin_s=500) == []
-    assert told(calm, (0.6,), begin_s=720) == [UNACKNOWLEDGED]
-
-
-def test_a_clock_that_was_set_back_does_not_keep_a_shift_from_being_confirmed():
-    alarm = ShiftAlarm()
-    assert told(alarm, (0.6,), begin_s=86_400) == []
-    alarm.shift_time(-86_400 * NS_PER_S)
-    assert told(alarm, (0.6,), begin_s=600) == [UNACKNOWLEDGED]
+    quick = ShiftAlarm()
+    assert told(quick, CALM, (0.6,), (0.6,), every_s=60) == []
+    assert told(quick, (0.6,), begin_s=500) == []
+    assert told(quick, (0.6,), begin_s=720) == [UNACKNOWLEDGED]
+    back = ShiftAlarm()
+    assert told(back, (0.6,), begin_s=86_400) == []
+    back.shift_time(-86_400 * NS_PER_S)
+    assert told(back, (0.6,), begin_s=600) == [UNACKNOWLEDGED]
 
 
 def test_what_the_last_curve_saw_outlives_a_restart():
-    first, second = ShiftAlarm(), ShiftAlarm()
+    first = ShiftAlarm()
     assert told(first, (0.6,)) == []
-    second.restore(first.snapshot())
-    assert told(second, (0.7,), begin_s=600) == [UNACKNOWLEDGED]
-    new = ('seen', 'seen_ns')
-    earlier = {key: value for key, value in first.snapshot().items() if key not in new}
-    third = ShiftAlarm()
-    third.restore(earlier)
-    assert told(third, (0.7,), begin_s=600) == []
+    assert told(taken_up(first, ShiftAlarm()), (0.7,), begin_s=600) == [UNACKNOWLEDGED]
+    earlier = ShiftAlarm()
+    saved = first.snapshot()
+    del saved['seen'], saved['seen_ns']
+    earlier.restore(saved)
+    assert told(earlier, (0.7,), begin_s=600) == []
 
 
 def test_it_stands_while_what_moved_is_out_of_the_window():
@@ -273,25 +268,59 @@ def test_it_stands_while_what_moved_is_out_of_the_window():
     assert alarm.ranges == ()
 
 
-def test_a_curve_that_cannot_be_compared_says_why():
-    monitor = with_curve()
-    far = replace(
-        monitor.characteristic,
-        pieces=tuple(
-            replace(p, u_from=p.u_from + 9e3, u_to=p.u_to + 9e3)
-            for p in monitor.characteristic.pieces
-        ),
-    )
-    monitor.set_reference(far)
-    events = feed_rows(monitor, following(monitor, 3, N))
-    assert all(e.shift is None for e in of_type(events, CurveAdopted))
-    assert 'nothing can be compared' in monitor.reference.problem
+# --- wear -------------------------------------------------------------------------------------
+
+DAY_NS = 86_400 * NS_PER_S
+BEGUN_NS = 20_000 * DAY_NS
+KNOTS, SLOPES = np.array([1000.0, 1500.0, 2200.0]), np.array([0.2, 0.1])
+BUDGET = Settings({'wear_budget': 3.0})
 
 
-# --- replay -----------------------------------------------------------------------------------
+def months_of_wear(mw_per_month, months, every_days=4):
+    """Run a reference over curves and segments of windows of ten days; return it and what came."""
+    reference, rng = ReferenceCurve(BUDGET), np.random.default_rng(1)
+    begun = []
+    for day in range(10, round(30 * months), every_days):
+        now_ns = BEGUN_NS + day * DAY_NS
+        found = curve(
+            KNOTS, SLOPES, start=150.0 + mw_per_month * (day - 5.0) / 30.0, stderr=2e-4,
+            samples=1000, model_id=f'day {day}',
+            source=FittedData(now_ns - 10 * DAY_NS, now_ns, 1, 1, 1000, 540.0, 1.0, False),
+            dynamics=(RegionDynamics(100.0, 400.0, 60.0, 5.0, 1.0, 1.0),),
+        )  # fmt: skip
+        segments = []
+        for k, at in enumerate(np.sort(rng.uniform(day - 10.0, day, 80))):
+            u, start_ns = rng.uniform(1050.0, 2150.0), BEGUN_NS + round(at * DAY_NS)
+            mw = float(np.interp(u, KNOTS, [150.0, 250.0, 320.0]))
+            mw += mw_per_month * at / 30.0 + rng.normal(0.0, 0.5)
+            segments.append(SpecialSegment(
+                k + 1, SegmentKind.STEADY, start_ns, start_ns + 400 * NS_PER_S, 400, u, u, 0.0,
+                1.0, mw, mw, 1.0, 540.0,
+            ))  # fmt: skip
+        reference.judge(found, segments, now_ns)
+        if reference.follow(None, False, now_ns):
+            begun.append(now_ns)
+        renewed = reference.renewed(found, now_ns)
+        if renewed is not None:
+            reference.renew(renewed, segments, now_ns)
+    return reference, begun
 
 
-def test_a_reference_that_cannot_be_read_stops_a_replay_with_a_sentence():
-    entry = JournalEntry(0, JournalKind.SET_REFERENCE, 0, 0, 'x', '{"format": 1')
-    with pytest.raises(DataError, match='change of reference cannot be read'):
-        JournalReplayer(Monitor(SETTINGS), [entry]).feed(plant(1, 5))
+@pytest.mark.parametrize('mw_per_month', [1.0, -1.0])
+def test_a_year_of_wear_is_followed_without_an_alarm_and_told(mw_per_month):
+    reference, begun = months_of_wear(mw_per_month, 12)
+    assert begun == []
+    wear = reference.wear
+    assert wear.mw_per_month == pytest.approx(mw_per_month, rel=0.2)
+    # What is behind is the mean of a window, which is some days old.
+    assert wear.total_mw == pytest.approx(11.5 * mw_per_month, rel=0.2)
+    assert wear.since_ns - BEGUN_NS < MONTH_NS
+    again = taken_up(reference, ReferenceCurve(BUDGET))
+    assert again.wear == wear
+    assert again.curve.model_id == reference.curve.model_id
+
+
+def test_wear_beyond_its_budget_raises_the_alarm_on_a_shift():
+    reference, begun = months_of_wear(-6.0, 6)
+    assert begun
+    assert reference.alarm.active

@@ -9,13 +9,13 @@ import re
 
 import numpy as np
 import pytest
-from alarm_story import NERVOUS, SlowLife, held_in, lived
+from alarm_story import NERVOUS, SlowLife, held_in, lived, restored
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import START_NS, blocks_of, cuts, examples, frozen
+from streams import START_NS, blocks_of, cuts, examples
 
 from valveflow_ros.errors import DataError
-from valveflow_ros.monitoring.alarm_state import AlarmAction, AlarmStateMachine, Priority
+from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmState, ResidualAlarm
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
@@ -65,9 +65,22 @@ def told(change):
     return change.previous.name, change.state.name, change.occurrence, held_in(change)
 
 
-@examples(100)
+# What may be told after what (ISA-18.2). The shelf and suppression may hide any state on the way.
+NEXT = {
+    NORMAL: {UNACKNOWLEDGED, SUPPRESSED},
+    UNACKNOWLEDGED: {ACKNOWLEDGED, RETURNED, NORMAL, SHELVED, SUPPRESSED},
+    ACKNOWLEDGED: {NORMAL, SHELVED, SUPPRESSED},
+    RETURNED: {NORMAL, UNACKNOWLEDGED, SHELVED, SUPPRESSED},
+    SHELVED: {UNACKNOWLEDGED, NORMAL, SUPPRESSED},
+    SUPPRESSED: {NORMAL, UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED, SHELVED},
+}
+
+
+@examples(150)
 @given(runs, rules, st.data())
-def test_rows_and_operators_give_what_the_slow_truth_gives_however_cut(plan, values, data):
+def test_rows_and_operators_give_what_the_slow_truth_gives_however_cut_and_restored(
+    plan, values, data
+):
     settings = Settings(values)
     time_ns, share = rows_of(plan)
     fast, slow = ResidualAlarm(settings), SlowLife(settings)
@@ -77,7 +90,10 @@ def test_rows_and_operators_give_what_the_slow_truth_gives_however_cut(plan, val
         for now_ns, value in zip(time_ns[start:end].tolist(), share[start:end], strict=True):
             slow.take(now_ns, value, 1.0)
         assert [(start + row, *told(c)) for row, c in changes] == slow.changes[before:]
-        assert all(c.time_ns == time_ns[start + row - 1] for row, c in changes)
+        for row, change in changes:
+            assert change.time_ns == time_ns[start + row - 1]
+            assert change.state in {change.previous, *NEXT[change.previous]}
+            assert 'nan' not in change.sentence
         for act in data.draw(acts) if end else ():
             before = len(slow.changes)
             done, pressed = fast.operate(AlarmAction(act), int(time_ns[end - 1]), 'm')
@@ -86,29 +102,16 @@ def test_rows_and_operators_give_what_the_slow_truth_gives_however_cut(plan, val
         assert (fast.state.name, fast.active) == (slow.state, slow.alarm.condition)
         assert fast.standing == (slow.alarm.state != 'NORMAL')
         assert (fast.occurrence, fast.held) == (slow.occurrences, slow.held)
+        fast = restored(fast, settings)
 
 
-@examples(60)
-@given(runs, st.data())
-def test_any_cutting_gives_the_same_changes(plan, data):
-    time_ns, share = rows_of(plan)
-    whole = feed(ResidualAlarm(Settings(QUICK)), time_ns, share)
-    alarm, changes = ResidualAlarm(Settings(QUICK)), []
-    for start, end in blocks_of(len(time_ns), data.draw(cuts(len(time_ns)))):
-        part = feed(alarm, time_ns[start:end], share[start:end])
-        changes += [(start + row, c) for row, c in part]
-    assert frozen(changes) == frozen(whole)
-
-
-@examples(60)
+@examples(40)
 @given(runs, st.sampled_from([0.5, 8.0]))
 def test_sign_and_scale_do_not_matter(plan, factor):
     time_ns, share = rows_of(plan)
     here = feed(ResidualAlarm(Settings(QUICK)), time_ns, share)
     there = ResidualAlarm(Settings(QUICK)).feed(time_ns, -share, -factor * share, 'm')
-    assert [(r, c.state, c.occurrence) for r, c in here] == [
-        (r, c.state, c.occurrence) for r, c in there
-    ]
+    assert [(r, told(c)) for r, c in here] == [(r, told(c)) for r, c in there]
 
 
 # --- stories ----------------------------------------------------------------------------------
@@ -119,19 +122,12 @@ SHELF = {**NERVOUS, 'alarm_shelve_time': 60.0}
 SAVED_WAITING = [([2.0, 0.0], 4), (2.0, 1), 'restore', (2.0, 100)]
 # Name: settings, steps, and the rows and states that are told.
 STORIES = {
-    'no rows': ({}, [(0.0, 0)], []),
     'the delay is the time beyond the limit': (QUICK, [(1.5, 5), (1.5, 1)], [(6, U)]),
     'on the limit is not beyond it, on the dead band not back': (
         QUICK, [(1.0, 60), (-1.0 - 1e-9, 60), (0.75, 60), (0.75 - 1e-9, 60)], [(66, U), (188, R)],
     ),
-    'returned, then acknowledged': (
-        QUICK, [(9.0, 20), (0.0, 20), 'acknowledge', 'acknowledge'], [(6, U), (28, R), (40, N)],
-    ),
     'acknowledged, then returned': (
         QUICK, [(9.0, 20), 'acknowledge', (0.0, 20), 'acknowledge'], [(6, U), (20, A), (28, N)],
-    ),
-    'without latch it clears by itself': (
-        {**QUICK, 'alarm_latch': False}, [(9.0, 20), (0.0, 20)], [(6, U), (28, N)],
     ),
     'nobody watched between rows far apart': (
         {'alarm_on_delay': 120.0}, [(9.0, 1), 7199, (9.0, 1), 7199, (9.0, 1)], [],
@@ -139,14 +135,9 @@ STORIES = {
     'a clock set back does not silence it': (
         QUICK, [86_400, (9.0, 3), -86_403, (9.0, 20)], [(9, U)],
     ),
-    'bad data do not raise': (QUICK, [(NAN, 100)], []),
     'bad data do not clear': (QUICK, [(9.0, 20), (NAN, 3599)], [(6, U)]),
-    'infinite evidence is beyond the limit': (NERVOUS, [(math.inf, 1)], [(1, U)]),
     'new delays count from now on': (
         QUICK, [(9.0, 20), {'alarm_off_delay': 1.0}, (0.0, 20)], [(6, U), (22, R)],
-    ),
-    'the first occurrence is never held back': (
-        {**NERVOUS, 'alarm_flood': 1}, [(2.0, 1)], [(1, U)],
     ),
     'held back, it is told as soon as may be': (
         NERVOUS, [([2.0, 0.0], 4), (2.0, 100)], [(1, U), (2, R), (3, U), (4, R), (61, U)],
@@ -159,17 +150,9 @@ STORIES = {
         [([2.0, 0.0], 4), (2.0, 1), {'alarm_flood': 100}, (2.0, 100)],
         [(1, U), (2, R), (3, U), (4, R), (61, U)],
     ),
-    'a lower limit holds back what was due': (
-        {**NERVOUS, 'alarm_flood': 4},
-        [([2.0, *[0.0] * 99], 400), (2.0, 2), {'alarm_flood': 1}, (2.0, 700)],
-        [*((100 * k + j, s) for k in range(4) for j, s in ((1, U), (2, R))), (901, U)],
-    ),
     'off the shelf with the cause there': (
         SHELF, [(2.0, 10), 'shelve', 'shelve', 'acknowledge', (2.0, 100)],
         [(1, U), (10, SH), (70, U)],
-    ),
-    'off the shelf with the cause gone': (
-        SHELF, [(2.0, 10), 'shelve', (0.0, 100)], [(1, U), (10, SH), (70, N)],
     ),
     'an occurrence on the shelf is not lost': (
         SHELF, [(2.0, 1), 'shelve', ([0.0, 2.0], 60)], [(1, U), (1, SH), (61, U)],
@@ -183,13 +166,6 @@ STORIES = {
     ),
     'suppressed, it stays what it was': (
         DARK, [(2.0, 5), (NAN, 100), (2.0, 50)], [(1, U), (35, SU), (115, U)],
-    ),
-    'suppressed, it stays acknowledged': (
-        DARK, [(2.0, 5), 'acknowledge', (NAN, 100), (2.0, 50)],
-        [(1, U), (5, A), (35, SU), (115, A)],
-    ),
-    'what does not show cannot be acknowledged': (
-        DARK, [(2.0, 1), (NAN, 40), 'acknowledge', (2.0, 100)], [(1, U), (31, SU), (51, U)],
     ),
     'a new occurrence ends suppression at once': (
         DARK, [(0.0, 1), (NAN, 40), (2.0, 1)], [(31, SU), (42, U)],
@@ -225,12 +201,6 @@ STORIES = {
         {**NERVOUS, 'alarm_shelve_time': 604_800.0, 'alarm_latch': False},
         [(2.0, 1), 'shelve', (0.0, 2 * DAY_S)], [(1, U), (1, SH)],
     ),
-    'suppressed what never was is not told again': (
-        DARK, [(0.0, 1), (NAN, 2 * DAY_S)], [(31, SU)],
-    ),
-    'acknowledged what is over is not told again': (
-        NERVOUS, [(2.0, 1), (0.0, 1), 'acknowledge', (0.0, 2 * DAY_S)], [(1, U), (2, R), (2, N)],
-    ),
 }  # fmt: skip
 
 
@@ -239,100 +209,6 @@ def test_what_is_told_and_when(settings, steps, wanted):
     _, told = lived(settings, *steps)
     assert [(row, c.state) for row, c in told] == wanted
     assert not any('nan' in c.sentence for _, c in told)
-
-
-@pytest.mark.parametrize(
-    ('name', 'occurrence', 'held'),
-    [('held back, it is told as soon as may be', 3, 0), ('an occurrence on the shelf is not lost',
-     31, 0), ('shelved again before its return was told', 1, 1),
-     ('suppressed, it stays what it was', 1, 0)],
-)  # fmt: skip
-def test_every_occurrence_is_counted(name, occurrence, held):
-    settings, steps, _ = STORIES[name]
-    alarm, told = lived(settings, *steps)
-    assert (alarm.occurrence, alarm.held) == (occurrence, held)
-    assert told[-1][1].occurrence == occurrence
-
-
-@pytest.mark.parametrize('latch', [True, False])
-@pytest.mark.parametrize('flood', [2, 5])
-def test_a_value_that_chatters_is_counted_and_told_in_few_words(latch, flood):
-    """Half an hour of coming and going every second, with neither delay nor dead band."""
-    given = {**NERVOUS, 'alarm_latch': latch, 'alarm_flood': flood}
-    alarm, told = lived(given, ([2.0, 0.0], 1800))
-    changes = [c for _, c in told]
-    announced = [c for c in changes if c.state == UNACKNOWLEDGED]
-    assert (announced[0], announced[0].occurrence) == (changes[0], 1)
-    assert len(announced) == 3 * flood
-    assert alarm.occurrence == 900
-    assert sum(held_in(c) for c in changes) + len(announced) + alarm.held == 900
-    last = announced[-1].time_ns
-    assert all(c.time_ns <= last + NS_PER_S for c in changes)
-
-
-def test_what_waits_is_counted_once_whatever_else_happens_meanwhile():
-    alarm, told = lived(NERVOUS, ([2.0, 0.0], 4), (2.0, 1), -105, (2.0, 1), -101, (2.0, 1))
-    assert (len(told), alarm.held) == (4, 1)
-
-
-def test_with_its_own_delays_it_cannot_chatter():
-    delay = {'alarm_on_delay': 0.0, 'alarm_off_delay': 300.0}
-    alarm, told = lived(delay, ([*[2.0] * 301, *[0.0] * 301], 6 * 3600))
-    # What comes back soon has to stay away for longer: for hours it is one alarm, come twice.
-    assert alarm.occurrence == sum(c.state == UNACKNOWLEDGED for _, c in told) == 2
-    assert not any('held back' in c.sentence for _, c in told)
-
-
-@pytest.mark.parametrize('out_min', [10, 30, 59])
-@pytest.mark.parametrize('before', [0.0, 2.0])
-def test_a_valve_beyond_the_curve_some_times_a_day_is_not_told(out_min, before):
-    """An alarm stays what it is, standing or not; and it sees what comes."""
-    beyond = (NAN, 60 * out_min)
-    steps = [(before, 3600), *[beyond, (before, 1200)] * 8, beyond, (2.0 - before, 1200)]
-    _, told = lived({'alarm_off_delay': 300.0}, *steps)
-    states = [UNACKNOWLEDGED, RETURNED] if before else [UNACKNOWLEDGED]
-    assert [c.state for _, c in told] == states
-    assert told[-1][0] > sum(count for _, count in steps[:-1])
-
-
-@pytest.mark.parametrize(('before', 'after'), [(1, 2), (1, 5), (2, 3), (4, 100)])
-def test_a_limit_that_is_raised_lets_out_what_waits_with_the_next_row(before, after):
-    waits = [([2.0, *[0.0] * 99], 100 * before), (2.0, 2)]
-    limit = {**NERVOUS, 'alarm_flood': before}
-    assert lived(limit, *waits)[0].held == 1
-    alarm, told = lived(limit, *waits, {'alarm_flood': after}, (2.0, 5))
-    row, change = told[-1]
-    assert (row, change.state) == (100 * before + 3, UNACKNOWLEDGED)
-    # It comes late, but nothing was missed.
-    assert (change.occurrence, held_in(change), alarm.held) == (before + 1, 0, 0)
-
-
-@pytest.mark.parametrize(
-    ('steps', 'state', 'begun'),
-    [
-        ([], UNACKNOWLEDGED, 0),
-        (['acknowledge'], ACKNOWLEDGED, 0),
-        ([(0.0, 1)], RETURNED, 1),
-        (['shelve'], SHELVED, 0),
-        (['shelve', (0.0, 1)], SHELVED, 0),  # latched, it waits below the shelf
-        ([(NAN, 30)], SUPPRESSED, 30),
-        (['acknowledge', (NAN, 30)], SUPPRESSED, 30),
-    ],
-)
-def test_what_stands_is_told_again_once_a_day(steps, state, begun):
-    settings = {**DARK, 'alarm_shelve_time': 604_800.0}
-    value = {RETURNED: 0.0, SUPPRESSED: NAN}.get(state, 0.0 if (0.0, 1) in steps else 2.0)
-    alarm, told = lived(settings, (2.0, 1), *steps, (value, 2 * DAY_S + 60))
-    first, *again = [c for c in told if c[1].state == state]
-    assert [row for row, _ in again] == [1 + begun + DAY_S, 1 + begun + 2 * DAY_S]
-    for _, change in again:
-        assert (change.state, change.previous, change.occurrence) == (state, state, 1)
-        assert change.raised_ns == told[0][1].raised_ns
-        if state in (SHELVED, SUPPRESSED):
-            assert change.sentence == first[1].sentence
-        else:
-            assert change.sentence.startswith('Active since 20')
-    assert alarm.last == again[-1][1]
 
 
 # --- sentences and state ------------------------------------------------------------------------
@@ -346,6 +222,7 @@ def test_what_stands_is_told_again_once_a_day(steps, state, begun):
         ([(1.07, 1), 'acknowledge'], r'^Acknowledged; .* 3\.2 MW more'),
         ([(2.0, 1), 'shelve'], r'^Shelved until 20\d\d-\d\d-\d\d \d\d:\d\d UTC; '),
         ([(2.0, 1), (NAN, 30)], r'could not be judged for 0\.5 min'),
+        ([(2.0, 1 + DAY_S)], r'^Active since 20'),
         ([(0.0, 1), (NAN, 30), (0.0, 10)], r'^The alarm can be judged again\.'),
     ],
 )
@@ -367,30 +244,8 @@ def test_where_the_residual_is_gone_it_still_says_how_far_it_was(share, words):
     )
 
 
-def test_a_change_carries_its_numbers():
-    alarm, ((row, change),) = lived(QUICK, (1.5, 6))
-    assert (row, change.time_ns, change.raised_ns) == (6, *[START_NS + 5 * NS_PER_S] * 2)
-    assert (change.value, change.limit, change.unit, change.occurrence) == (1.5, 1.0, '', 1)
-    assert alarm.due_ns == change.time_ns + DAY_S * NS_PER_S
-
-
-def test_what_was_told_last_is_saved_with_the_alarm():
-    assert lived(NERVOUS, 'restore')[0].last is None
-    other, ((_, told),) = lived(NERVOUS, (2.0, 1), 'restore')
-    assert other.last == told
-    assert isinstance(other.last.state, AlarmState)
-    assert isinstance(other.last.priority, Priority)
-
-
 def test_what_does_not_fit_is_not_restored():
     alarm = ResidualAlarm(Settings())
     saved = alarm.snapshot()
     with pytest.raises(DataError, match="'memory'"):
         alarm.restore({**saved, 'memory': np.zeros(3, dtype=np.int64)})
-
-
-def test_a_life_without_events_is_normal():
-    life = AlarmStateMachine()
-    assert (life.state, life.standing, life.acknowledge(), life.unshelve(), life.shelve(1)) == (
-        NORMAL, False, False, False, False,
-    )  # fmt: skip

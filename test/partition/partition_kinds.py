@@ -16,78 +16,28 @@ def valve(u):
     )
 
 
-def _opening(n, r):
-    return r.uniform(1000.0, 2336.0, n)
+def _over_openings(answer):
+    """Return the maker of samples whose y is an answer to uniform openings."""
+
+    def make(n, r):
+        u = r.uniform(1000.0, 2336.0, n)
+        return u, answer(u, r)
+
+    return make
 
 
 def _share(u):
     return (u - 1000.0) / 1336.0
 
 
-def _valve(n, r):
-    u = _opening(n, r)
-    return u, valve(u) + r.normal(0, 3, n)
-
-
-def _quantised(n, r):
-    u = np.round(_opening(n, r), 1)
-    return u, valve(u) + r.normal(0, 3, n)
-
-
-def _noise(n, r):
-    return _opening(n, r), r.normal(0, 1, n)
-
-
-def _cauchy_u(n, r):
-    return r.standard_cauchy(n), r.normal(0, 1, n)
-
-
-def _root(n, r):
-    u = _opening(n, r)
-    return u, 100.0 * np.sqrt(_share(u)) + r.normal(0, 1, n)
-
-
-def _square(n, r):
-    u = _opening(n, r)
-    return u, 100.0 * _share(u) ** 2 + r.normal(0, 0.05, n)
-
-
-def _heavy_tails(n, r):
-    u = _opening(n, r)
-    return u, valve(u) + 3.0 * r.standard_t(3, n)
-
-
 def _correlated(n, r):
-    u = np.sort(_opening(n, r))
+    u = np.sort(r.uniform(1000.0, 2336.0, n))
     drift = np.empty(n)
     last = 0.0
     for k in range(n):
         last = 0.9 * last + r.normal(0, 3)
         drift[k] = last
     return u, valve(u) + drift
-
-
-def _walk(n, r):
-    return np.sort(_opening(n, r)), np.cumsum(r.normal(0, 1, n))
-
-
-def _sine(n, r):
-    u = _opening(n, r)
-    return u, 50.0 * np.sin(5 * np.pi * _share(u)) + r.normal(0, 1, n)
-
-
-def _noiseless(n, r):
-    u = _opening(n, r)
-    return u, valve(u)
-
-
-def _straight(n, r):
-    u = _opening(n, r)
-    return u, 0.24 * u - 100.0
-
-
-def _binary(n, r):
-    return _opening(n, r), (r.uniform(size=n) < 0.5) * 1.0
 
 
 def _outliers(n, r):
@@ -126,10 +76,18 @@ def _heavy_ties(n, r):
 
 
 KINDS = {
-    name[1:]: make
-    for name, make in list(globals().items())
-    if callable(make) and name.startswith('_') and name not in ('_opening', '_share')
-}
+    'valve': _over_openings(lambda u, r: valve(u) + r.normal(0, 3, len(u))),
+    'noise': _over_openings(lambda u, r: r.normal(0, 1, len(u))),
+    'root': _over_openings(lambda u, r: 100.0 * np.sqrt(_share(u)) + r.normal(0, 1, len(u))),
+    'square': _over_openings(lambda u, r: 100.0 * _share(u) ** 2 + r.normal(0, 0.05, len(u))),
+    'noiseless': _over_openings(lambda u, r: valve(u)),
+    'straight': _over_openings(lambda u, r: 0.24 * u - 100.0),
+    'binary': _over_openings(lambda u, r: (r.uniform(size=len(u)) < 0.5) * 1.0),
+    'cauchy_u': lambda n, r: (r.standard_cauchy(n), r.normal(0, 1, n)),
+    'correlated': _correlated, 'outliers': _outliers, 'clumps': _clumps,
+    'steady_and_ramps': _steady_and_ramps, 'geometric': _geometric,
+    'tight_far_from_zero': _tight_far_from_zero, 'heavy_ties': _heavy_ties,
+}  # fmt: skip
 
 
 def samples(kind, n, seed=0):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from partition_kinds import samples, valve
+from partition_kinds import samples
 
 from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.partition.paper_rule import paper_rule, select
@@ -33,9 +33,10 @@ FALLING = st.lists(st.floats(1.001, 100.0), min_size=3, max_size=11).map(
 )
 
 
-@given(FALLING)
-def test_the_rule_is_equation_24(cost):
+@given(FALLING, st.floats(1e-9, 1e9))
+def test_the_rule_is_equation_24_and_knows_no_scale(cost, factor):
     angles, pieces = paper_rule(cost)
+    assert paper_rule([factor * c for c in cost])[0] == pytest.approx(angles, abs=1e-9)
     truth = naive.turning_angle(cost)
     assert angles == pytest.approx(truth, abs=1e-9)
     assert truth[pieces] == pytest.approx(max(truth.values()), abs=1e-9)
@@ -48,13 +49,6 @@ def test_the_rule_always_answers_within_its_range(cost):
     assert all(-1.0 <= angle <= 1.0 for angle in angles.values())  # so none is NaN
     assert 2 <= pieces <= len(cost) - 1
     assert angles[pieces] == max(angles.values())
-
-
-@given(FALLING, st.floats(1e-9, 1e9))
-def test_the_rule_knows_no_scale(cost, factor):
-    angles, _ = paper_rule(cost)
-    scaled, _ = paper_rule([factor * c for c in cost])
-    assert scaled == pytest.approx(angles, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +91,7 @@ def test_the_paper_s_curve_has_four_pieces():
 
 
 @pytest.mark.parametrize('kind', ['noise', 'binary', 'cauchy_u'])
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 def test_noise_about_a_line_is_one_piece(kind, seed):
     u, y = samples(kind, N, seed)
     selection = select(partition(u, y))
@@ -108,28 +102,13 @@ def test_noise_about_a_line_is_one_piece(kind, seed):
 
 @pytest.mark.parametrize(
     'y',
-    [
-        lambda u: 0.24 * u - 100.0,
-        lambda u: 0.0 * u,
-        lambda u: 0.0 * u + 1e6,
-        lambda u: 1e-9 * u,
-        lambda u: (0.24 * u - 100.0).astype(np.float32),
-        lambda u: 1e8 + u * 1e-3,
-    ],
+    [lambda u: 0.0 * u, lambda u: (0.24 * u - 100.0).astype(np.float32), lambda u: 1e8 + u * 1e-3],
 )
 def test_an_exact_line_is_one_piece(y):
     u, _ = samples('straight', N)
     selection = select(partition(u, y(u)))
     assert selection.pieces == 1
     assert selection.note == 'One line fits exactly.'
-
-
-def test_correlation_makes_chance_larger():
-    u = np.linspace(1200.0, 1300.0, N)
-    noise = np.random.default_rng(8).normal(0, 1, N)
-    found = partition(u, valve(u) + noise, 5)
-    assert select(found).pieces > 1
-    assert select(found, correlation_inflation=1e4).pieces == 1
 
 
 def test_few_distinct_u_leave_few_choices():

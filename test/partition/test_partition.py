@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from partition_kinds import KINDS, samples, valve
+from partition_kinds import KINDS, samples
 
 from valveflow_ros.errors import DataError, ParameterError, TooFewSamplesError
 from valveflow_ros.partition.partition import partition
 
 COMPILED = not numba.config.DISABLE_JIT
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES = settings(max_examples=25 if COMPILED else 3)
+EXAMPLES = settings(max_examples=20 if COMPILED else 3)
 SEEDS = st.integers(0, 10**6)
 
 
@@ -46,24 +46,13 @@ def noisy_samples(seed):
 
 
 @EXAMPLES
-@given(SEEDS, st.integers(2, 5))
-def test_costs_are_the_least(seed, shortest):
+@given(SEEDS, st.integers(2, 5), st.booleans())
+def test_costs_are_the_least(seed, shortest, weighted):
     r = np.random.default_rng(seed)
     u = np.sort(r.choice(np.arange(400), int(r.integers(20, 60)), replace=False) / 7.0)
     y = r.normal(size=len(u)) + np.abs(u - 20.0)
-    found = partition(u, y, 4, shortest)
-    truth = naive.best_costs(naive.piece_costs(u, y, np.ones(len(u))), 4, shortest)
-    assert found.cost == pytest.approx([float(row[-1]) for row in truth], rel=1e-10)
-
-
-@EXAMPLES
-@given(SEEDS, st.integers(2, 4))
-def test_weighted_costs_are_the_least(seed, shortest):
-    r = np.random.default_rng(seed)
-    u = np.sort(r.choice(np.arange(400), int(r.integers(20, 60)), replace=False) / 7.0)
-    y = r.normal(size=len(u)) + np.abs(u - 20.0)
-    weight = 10.0 ** r.uniform(-2.0, 2.0, len(u))
-    found = partition(u, y, 4, shortest, weight=weight)
+    weight = 10.0 ** r.uniform(-2.0, 2.0, len(u)) if weighted else np.ones(len(u))
+    found = partition(u, y, 4, shortest, weight=weight if weighted else None)
     truth = naive.best_costs(naive.piece_costs(u, y, weight), 4, shortest)
     assert found.certified
     assert found.cost == pytest.approx([float(row[-1]) for row in truth], rel=1e-9)
@@ -87,17 +76,6 @@ def test_whole_weights_are_repeated_samples_and_a_common_factor_scales_the_cost(
         assert one.slope == pytest.approx(other.slope)
         assert (one.u_from, one.u_to) == (other.u_from, other.u_to)
     assert partition(u, y, 4, weight=7.5 * times).cost == pytest.approx(7.5 * found.cost)
-
-
-@pytest.mark.parametrize(
-    ('weight', 'what'),
-    [([1.0, 2.0], 'as long as u'), ([1.0, 0.0, 1.0], r'weight\[1\] is 0'),
-     ([1.0, 1.0, math.nan], r'weight\[2\] is nan'), ([1e9, 1.0, 1.0], 'between'),
-     (['a', 'b', 'c'], 'real numbers')],
-)  # fmt: skip
-def test_what_is_no_weight_is_refused(weight, what):
-    with pytest.raises(DataError, match=what):
-        partition([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], 1, weight=weight)
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -128,22 +106,11 @@ def test_a_piece_is_the_least_squares_line_with_its_errors():
     for (a, b), piece in zip(itertools.pairwise(found.breaks(3)), found.pieces(3), strict=True):
         table = np.column_stack([found.u[a:b], np.ones(b - a)])
         (slope, intercept), rest, *_ = np.linalg.lstsq(table, found.y[a:b], rcond=None)
-        variance = rest[0] / (b - a - 2) * np.linalg.inv(table.T @ table)
-        assert piece.slope == pytest.approx(slope)
-        assert piece.intercept == pytest.approx(intercept)
-        assert piece.sse == pytest.approx(rest[0])
-        assert piece.slope_stderr == pytest.approx(np.sqrt(variance[0, 0]))
-        assert piece.intercept_stderr == pytest.approx(np.sqrt(variance[1, 1]))
-
-
-def test_the_paper_s_curve_is_found():
-    r = np.random.default_rng(11)
-    u = r.uniform(1000.0, 2336.0, 4000 if COMPILED else 400)
-    found = partition(u, valve(u) + r.normal(0, 0.5, len(u)), 5)
-    knees = [p.u_to for p in found.pieces(4)[:-1]]
-    assert np.abs(np.array(knees) - [1250.0, 1600.0, 1900.0]).max() < 40.0
-    slopes = [p.slope for p in found.pieces(4)]
-    assert np.abs(np.array(slopes) - [0.24, 0.18, 0.09, 0.01]).max() < 0.01
+        errors = np.sqrt(np.diag(rest[0] / (b - a - 2) * np.linalg.inv(table.T @ table)))
+        assert (piece.slope, piece.intercept, piece.sse) == pytest.approx(
+            (slope, intercept, rest[0])
+        )
+        assert (piece.slope_stderr, piece.intercept_stderr) == pytest.approx(tuple(errors))
 
 
 # --- relations ------------------------------------------------------------------------------
@@ -176,19 +143,6 @@ def test_cost_and_breaks_follow_what_is_done_to_the_samples(name, seed):
 
 
 @EXAMPLES
-@given(SEEDS, st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
-def test_shifting_changes_intercepts_only(seed, by_u, by_y):
-    u, y = noisy_samples(seed)
-    here, there = partition(u, y, 3), partition(u + by_u, y + by_y, 3)
-    assert there.cost == pytest.approx(here.cost, rel=1e-6)
-    for a, b in zip(here.pieces(3), there.pieces(3), strict=True):
-        assert b.samples == a.samples
-        assert b.slope == pytest.approx(a.slope, rel=1e-5, abs=1e-5)
-        moved = a.intercept + by_y - a.slope * by_u
-        assert b.intercept == pytest.approx(moved, rel=1e-5, abs=1e-5 * (1 + abs(by_u)))
-
-
-@EXAMPLES
 @given(SEEDS)
 def test_the_order_of_the_samples_changes_nothing(seed):
     u, y = random_samples(seed)
@@ -196,15 +150,6 @@ def test_the_order_of_the_samples_changes_nothing(seed):
     one, other = partition(u, y, 4), partition(u[order], y[order], 4)
     assert np.array_equal(one.cost, other.cost)
     assert all(np.array_equal(a, b) for a, b in zip(one.starts, other.starts, strict=True))
-
-
-@EXAMPLES
-@given(SEEDS)
-def test_more_pieces_never_cost_more(seed):
-    u, y = random_samples(seed)
-    found = partition(u, y, 5)
-    if len(found.cost) * 4 <= found.n_distinct:  # there is always a piece left to split
-        assert np.all(np.diff(found.cost) <= found.tolerance + found.floor)
 
 
 # --- the trap -------------------------------------------------------------------------------
@@ -260,27 +205,25 @@ def with_value(value, *at):
     ('u', 'y', 'more', 'error', 'words'),
     [
         (with_value(np.nan, 4), LINE, {}, DataError, r'^u\[4\] is nan: every sample must be fin'),
-        (with_value(np.inf, 4), LINE, {}, DataError, r'^u\[4\] is inf: every'),
         (LINE, with_value(-np.inf, 4), {}, DataError, r'^y\[4\] is -inf: every'),
         (with_value(np.nan, 2, 5, 6), LINE, {}, DataError, r'^u\[2\] is.*\(3 such samples\)\.$'),
         (LINE, with_value(-1e200, 3), {}, DataError, r'^y\[3\] is -1e\+200: .* within 1e\+100\.$'),
         (np.zeros((3, 3)), np.zeros((3, 3)), {}, DataError, 'one-dimensional and equally long'),
         (np.arange(4.0), np.arange(5.0), {}, DataError, 'one-dimensional and equally long'),
-        (1.0, 2.0, {}, DataError, 'one-dimensional and equally long'),
         ([0.0, 1.0], ['a', 'b'], {}, DataError, 'must hold real numbers'),
-        ([0.0, 1.0], [1j, 2j], {}, DataError, 'must hold real numbers'),
         ([0.0, 1.0], [None, 1.0], {}, DataError, 'must hold real numbers'),
         ([], [], {}, TooFewSamplesError, 'Samples: 0 found, at least 2 needed'),
-        ([0.0], [0.0], {}, TooFewSamplesError, 'Samples: 1 found, at least 2 needed'),
-        *(
-            (np.full(9, u), LINE, {}, DataError, r'^u is \S+ in all 9 samples: a slope needs')
-            for u in (0.0, 5.0, -1e6, 1e-200)
-        ),
+        *((np.full(9, u), LINE, {}, DataError, r'^u is \S+ in all 9 samples: a slope needs')
+          for u in (0.0, -1e6, 1e-200)),
         (LINE // 3, LINE, {'min_distinct': 5}, TooFewSamplesError,
          r'Distinct values of u.*: 3 found, at least 5'),
         (LINE, LINE, {'max_pieces': 0}, ParameterError, 'max_pieces'),
         (LINE, LINE, {'min_distinct': 1}, ParameterError, 'min_distinct'),
         (LINE, LINE, {'threads': 0}, ParameterError, 'threads'),
+        *((LINE, LINE, {'weight': weight}, DataError, words) for weight, words in (
+            ([1.0, 2.0], 'as long as u'), (with_value(0.0, 1), r'weight\[1\] is 0'),
+            (with_value(math.nan, 0), r'weight\[0\] is nan'), (['a'] * 9, 'real numbers'),
+        )),
     ],
 )  # fmt: skip
 def test_what_cannot_be_divided_is_refused_with_a_sentence(u, y, more, error, words):
@@ -297,53 +240,24 @@ def test_fewer_pieces_than_asked_for_is_said():
         found.breaks(4)
 
 
-def test_two_samples_are_a_line_without_errors():
-    found = partition([2.0, 1.0], [5.0, 3.0])
-    (piece,) = found.pieces(1)
-    assert piece.slope == 2.0
-    assert piece.intercept == 1.0
-    assert found.cost[0] == 0.0
-    assert np.isnan(piece.slope_stderr)
-    assert np.isnan(piece.intercept_stderr)
-
-
-def test_input_is_neither_changed_nor_needed_afterwards():
-    u, y = samples('valve', 90)
-    kept = u.copy(), y.copy()
-    u.flags.writeable = False
-    y.flags.writeable = False
-    found = partition(u, y, 3)
-    assert np.array_equal(u, kept[0])
-    assert np.array_equal(y, kept[1])
-    assert not np.shares_memory(found.u, u)
-    assert not found.u.flags.writeable
-
-
-@pytest.mark.parametrize('kind', [list, np.float32, np.float64, '>f8', np.longdouble])
-def test_any_array_of_numbers_will_do(kind):
+@pytest.mark.parametrize('kind', [list, np.float32, '>f8', np.longdouble, 'strided'])
+def test_any_array_of_numbers_will_do_and_is_neither_changed_nor_needed_afterwards(kind):
     u, y = samples('valve', 120)
     truth = partition(u, y, 3)
-    u, y = (u.tolist(), y.tolist()) if kind is list else (u.astype(kind), y.astype(kind))
+    if kind == 'strided':
+        u, y = np.column_stack([u, y]).T
+    elif kind is list:
+        u, y = u.tolist(), y.tolist()
+    else:
+        u, y = u.astype(kind), y.astype(kind)
+        u.flags.writeable = y.flags.writeable = False
+    kept = list(u), list(y)
     found = partition(u, y, 3)
     assert found.cost == pytest.approx(truth.cost, rel=1e-4)
     assert found.certified
-
-
-def test_integers_and_strided_views():
-    u = np.arange(60)[::-1]
-    table = np.column_stack([u, np.abs(u - 20)])
-    found = partition(table[:, 0], table[:, 1], 2)
-    assert found.cost[1] <= found.floor
-    assert found.breaks(2)[1] in (20, 21)
-
-
-@pytest.mark.parametrize('offset', [1e6, -1e6, 1e9])
-def test_a_large_offset_costs_no_digits_that_matter(offset):
-    u = np.arange(200.0)
-    y = np.abs(u - 80.0) + np.sin(u)
-    truth, found = partition(u, y, 4), partition(u + offset, y + offset, 4)
-    assert found.cost == pytest.approx(truth.cost, rel=1e-6)
-    assert found.certified
+    assert (list(u), list(y)) == kept
+    assert not np.shares_memory(found.u, u)
+    assert not found.u.flags.writeable
 
 
 def test_nearly_equal_u_are_one():
@@ -354,15 +268,6 @@ def test_nearly_equal_u_are_one():
     assert rough.n_distinct == 30
     assert rough.cost == pytest.approx(partition(u, y, 4).cost, rel=1e-6)
     assert rough.certified
-
-
-def test_exact_lines_cost_nothing():
-    found = partition(*samples('noiseless', 500 if COMPILED else 90), 6)
-    assert found.cost[2] > 1.0
-    assert np.all(found.cost[3:] <= found.tolerance)
-    flat = partition(np.arange(100.0), np.full(100, 7.5), 3)
-    assert np.all(flat.cost == 0.0)
-    assert flat.certified
 
 
 def test_it_runs_without_the_compiler():

@@ -49,26 +49,21 @@ def compare(kind, n, shortest, seed=0):
     pytest.fail('the search ended early')
 
 
-@pytest.mark.parametrize('shortest', [2, 7, 33])
+@pytest.mark.parametrize('shortest', [2, 33])
 @pytest.mark.parametrize('kind', KINDS)
 def test_every_layer_and_end_is_optimal(kind, shortest):
     compare(kind, 500 if COMPILED else 140, shortest, seed=shortest)
 
 
-@pytest.mark.parametrize('n', [2, 3, 20, 63, 64, 65, 127, 128, 129, 130])
+@pytest.mark.parametrize('n', [2, 3, 63, 64, 65, 128, 129])
 def test_blocks_begin_and_end_anywhere(n):
     compare('noise', n, 2, seed=n)
 
 
 @pytest.mark.skipif(not COMPILED, reason='too slow without the compiler')
-@pytest.mark.parametrize('kind', ['valve', 'clumps', 'square'])
-def test_several_levels_of_nodes(kind):
-    compare(kind, 1700, 2)
-
-
-@pytest.mark.skipif(not COMPILED, reason='too slow without the compiler')
-def test_a_long_shortest_piece_spans_blocks():
-    compare('valve', 1500, 140)
+@pytest.mark.parametrize(('kind', 'shortest'), [('clumps', 2), ('square', 2), ('valve', 140)])
+def test_several_levels_of_nodes_and_a_shortest_piece_longer_than_a_block(kind, shortest):
+    compare(kind, 1500, shortest)
 
 
 def test_the_result_does_not_depend_on_the_threads():
@@ -97,16 +92,6 @@ def test_searches_may_run_side_by_side():
     assert np.array_equal(found[1], alone[1])
 
 
-def test_one_thread_starts_none(monkeypatch):
-    def refuse(*_args, **_kwargs):
-        pytest.fail('a thread was started')
-
-    levels = make_levels(*samples('valve', 300))
-    monkeypatch.setattr(threading, 'Thread', refuse)
-    cost, _ = best_partitions(problem(levels, 2, threads=1), 4)
-    assert np.isfinite(cost).all()
-
-
 @pytest.mark.skipif(not COMPILED, reason='counts are those of the compiled search')
 @pytest.mark.parametrize('kind', ['valve', 'noise', 'noiseless', 'straight'])
 def test_far_breaks_are_passed_over(kind, monkeypatch):
@@ -118,14 +103,3 @@ def test_far_breaks_are_passed_over(kind, monkeypatch):
     best_partitions(problem(levels, 2), 4)
     groups = 20_000 / 64
     assert sum(opened) < 0.1 * 3 * groups * groups / 2
-
-
-def test_the_tables_of_the_naive_truth_are_right():
-    u, y = samples('valve', 40)
-    order = np.argsort(u)
-    u, y = u[order], y[order]
-    table = naive.piece_costs(u, y, np.ones(40))
-    for a, b in ((0, 40), (3, 7), (10, 12), (20, 35)):
-        assert float(table[a, b]) == pytest.approx(
-            float(naive.line_cost(u[a:b], y[a:b])), rel=1e-12, abs=1e-12
-        )

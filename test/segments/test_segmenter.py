@@ -27,7 +27,7 @@ from streams import (
 
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SegmentKind, Signal
-from valveflow_ros.segments.kernel import NO_DATA, SETTLED_SLOPE, SETTLED_STEADY, TRANSIENT
+from valveflow_ros.segments.kernel import TRANSIENT
 from valveflow_ros.segments.segmenter import Segmenter
 
 # Seconds instead of minutes, so that a few hundred rows hold many segments.
@@ -78,13 +78,9 @@ def plant(seed, n, noise=0.5, hold=(30, 90)):
     )
 
 
+KINDS = ['nan_u', 'nan_power', 'inf', 'nan_temperature', 'leap', 'back']
 harm = st.lists(
-    st.tuples(
-        st.sampled_from(['nan_u', 'nan_power', 'inf', 'nan_temperature', 'leap', 'back']),
-        st.integers(0, 599),
-        st.integers(1, 40),
-    ),
-    max_size=6,
+    st.tuples(st.sampled_from(KINDS), st.integers(0, 599), st.integers(1, 40)), max_size=6
 )
 
 
@@ -123,13 +119,9 @@ def spans(found):
 
 @examples(40)
 @given(
-    st.integers(0, 2**32 - 1),
-    st.integers(1, 600),
-    harm,
-    st.sampled_from([1.0, 3.0]),
-    st.booleans(),
-    st.data(),
-)
+    st.integers(0, 2**32 - 1), st.integers(1, 600), harm, st.sampled_from([1.0, 3.0]),
+    st.booleans(), st.data(),
+)  # fmt: skip
 def test_every_block_gives_what_the_slow_truth_gives(seed, n, harms, block, given_noise, data):
     values = {**QUICK, 'block': block}
     if not given_noise:
@@ -170,15 +162,6 @@ def test_every_block_gives_what_the_slow_truth_gives(seed, n, harms, block, give
             assert given_noise or noise.learnt == (len(slow.stretches) >= 4)
 
 
-def test_noise_is_learnt_from_the_data():
-    segmenter = Segmenter(Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0}))
-    assert not segmenter.noise().learnt
-    segmenter.feed(*plant(3, 700, hold=(100, 200)).part(0, 700))
-    noise = segmenter.noise()
-    assert noise.learnt
-    assert (noise.input, noise.power_mw) == pytest.approx((0.5, 0.15), rel=0.3)
-
-
 @examples(40)
 @given(st.integers(0, 2**32 - 1), harm, st.data())
 def test_any_cutting_gives_the_same_bits(seed, harms, data):
@@ -200,47 +183,7 @@ def test_any_cutting_gives_the_same_bits(seed, harms, data):
     assert [frozen(f) for f in found] == [frozen(f) for f in expected.found]
 
 
-@examples(30)
-@given(st.integers(0, 2**32 - 1), harm)
-def test_after_a_gap_the_transient_never_counts(seed, harms):
-    stream = harmed(plant(seed, 600), harms)
-    out, _ = whole(Settings(QUICK), stream)
-    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
-    good = usable.copy()
-    good[1:] &= np.diff(stream.time_ns) == NS_PER_S
-    good[0] = False  # what was before the first row nobody knows
-    for _, f in out.found:
-        assert good[max(0, f.first_row - SETTLE + 1) : f.end_row].all()
-    settled = np.flatnonzero(out.kinds != TRANSIENT)
-    for row in settled[out.kinds[settled] != NO_DATA]:
-        assert good[max(0, row - SETTLE + 2) : row + 1].all()
-
-
-@examples(30)
-@given(st.integers(0, 2**32 - 1), harm)
-def test_rows_without_data_are_named_and_poison_nothing(seed, harms):
-    stream = harmed(plant(seed, 600), harms)
-    out, segmenter = whole(Settings(QUICK), stream)
-    usable = np.isfinite(stream.u) & np.isfinite(stream.power)
-    assert np.array_equal(out.kinds == NO_DATA, ~usable)
-    for _, f in out.found:
-        numbers = [v for v in given_by_the_segmenter(f.segment) if isinstance(v, float)]
-        finite = np.isfinite(numbers)
-        warm = np.isfinite(stream.temperature[f.first_row : f.end_row])
-        assert finite.all() or not warm.all()
-        assert np.isfinite(f.segment.temperature_mean_degc) == warm.any()
-    after = plant(seed, 300)
-    later = segmenter.feed(after.time_ns + 10**13, after.u, after.power, after.temperature)
-    expected, _ = whole(Settings(QUICK), after)
-    assert later.kinds.tolist() == expected.kinds.tolist()
-    # The gap before it may have closed a segment of what came before.
-    fresh = [f for _, f in later.found if f.first_row >= 600]
-    assert [(f.segment.u_start, f.segment.power_end_mw) for f in fresh] == [
-        (f.segment.u_start, f.segment.power_end_mw) for _, f in expected.found
-    ]
-
-
-@examples(30)
+@examples(20)
 @given(
     st.integers(0, 2**32 - 1), harm, st.sampled_from([-900.0, 64.0, 1e6]),
     st.sampled_from([-150.0, 1024.0]),
@@ -262,7 +205,7 @@ def test_shifting_u_or_power_moves_no_segment(seed, harms, more_u, more_power):
         )
 
 
-@examples(30)
+@examples(20)
 @given(st.integers(0, 2**32 - 1), harm, st.sampled_from([0.25, 4.0, -1.0, -64.0]),
        st.sampled_from([0.5, -2.0]))  # fmt: skip
 def test_scaling_signals_and_their_noise_together_moves_no_segment(seed, harms, u_by, power_by):
@@ -278,35 +221,6 @@ def test_scaling_signals_and_their_noise_together_moves_no_segment(seed, harms, 
         assert b.segment.power_rms_mw == abs(power_by) * a.segment.power_rms_mw
 
 
-@examples(10)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([10.0, 1000.0]))
-def test_noise_learnt_scales_with_the_signals(seed, factor):
-    settings = Settings({**QUICK, 'input_noise': 0.0, 'power_noise': 0.0})
-    stream = plant(seed, 600)
-    there = Stream(stream.time_ns, factor * stream.u, factor * stream.power, stream.temperature)
-    _, here = whole(settings, stream)
-    _, other = whole(settings, there)
-    # A number on the edge of a bin of the histogram may fall to either side: 6 %.
-    assert other.noise().input == pytest.approx(factor * here.noise().input, rel=0.06)
-    assert other.noise().power_mw == pytest.approx(factor * here.noise().power_mw, rel=0.06)
-
-
-@examples(20)
-@given(st.integers(0, 2**32 - 1), harm, st.integers(-(10**6), 10**6))
-def test_shifting_time_moves_stamps_only(seed, harms, seconds):
-    stream = harmed(plant(seed, 600), harms)
-    shift = seconds * NS_PER_S
-    there = Stream(stream.time_ns + shift, stream.u, stream.power, stream.temperature)
-    here, _ = whole(Settings(QUICK), stream)
-    other, _ = whole(Settings(QUICK), there)
-    assert here.kinds.tolist() == other.kinds.tolist()
-    for (_, a), (_, b) in zip(here.found, other.found, strict=True):
-        moved = dataclasses.replace(
-            a.segment, start_ns=a.segment.start_ns + shift, end_ns=a.segment.end_ns + shift
-        )
-        assert frozen(moved) == frozen(b.segment)
-
-
 def hold_ramp_hold(rng, n, at, rate, length, noise):
     """Return u with one ramp, and the power lagging behind it (T = 80 s, tau = 10 s)."""
     u = np.full(n, 1300.0)
@@ -316,8 +230,8 @@ def hold_ramp_hold(rng, n, at, rate, length, noise):
     return u + noise * rng.normal(0.0, 1.0, n), power + 0.5 * rng.normal(0.0, 1.0, n)
 
 
-@pytest.mark.parametrize('rate', [0.3, -0.3, 1.0, -2.0])
-@pytest.mark.parametrize('seed', range(1 if INTERPRETED else 6))
+@pytest.mark.parametrize('rate', [0.3, -2.0])
+@pytest.mark.parametrize('seed', range(1 if INTERPRETED else 3))
 def test_no_segment_begins_or_ends_in_the_transient_of_a_ramp(seed, rate):
     """The first 5 T + tau after a ramp begins are transient, eq. (13); so is what follows it."""
     rng = np.random.default_rng(seed)
@@ -349,30 +263,9 @@ def segments_of_the_simulated_plant(seed):
 
 
 @needs_jit
-@pytest.mark.parametrize('seed', [1, 5])
-def test_no_segment_of_the_simulated_plant_begins_in_the_transient_of_a_clear_ramp(seed):
-    """A move of u is seen to the minute, so the first 5 T + tau less a minute must be free."""
-    log, _, found, noise = segments_of_the_simulated_plant(seed)
-    moving = np.abs(np.diff(log.load_mw)) > 1e-6
-    starts = np.flatnonzero(moving[1:] & ~moving[:-1]) + 1
-    ends = np.flatnonzero(~moving[1:] & moving[:-1]) + 1
-    clear = 0
-    for start in starts:
-        end = min([*ends[ends > start][:1], start + 300, len(log) - 1])
-        if abs(log.true_u[end] - log.true_u[start]) < 15.0 * noise.input:
-            continue
-        clear += 1
-        for first, last, kind in found:
-            assert not start < first < start + Settings().settle_s - 60, (start, first, kind)
-            if kind == SegmentKind.STEADY and first < start:
-                assert last <= start + 60, (start, first, last)
-    assert clear > 60
-
-
-@needs_jit
-@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize('seed', [1])
 def test_steady_segments_of_the_simulated_plant_tell_its_true_curve(seed):
-    """Over three days the power without noise in them is F(u), without bias."""
+    """The power without noise in them is F(u), without bias."""
     log, u, found, _ = segments_of_the_simulated_plant(seed)
     truth = log.unit.curve
     steady = [(a, b) for a, b, kind in found if kind == SegmentKind.STEADY]
@@ -386,20 +279,7 @@ def test_steady_segments_of_the_simulated_plant_tell_its_true_curve(seed):
     assert abs(measured.mean()) < 4.0 * measured.std() / np.sqrt(len(measured))
 
 
-@pytest.mark.parametrize('length', [300, 1500])
-def test_kinds_say_slope_on_a_ramp_longer_than_the_transient_and_steady_on_a_hold(length):
-    u, power = hold_ramp_hold(np.random.default_rng(2), 9000, 4000, 1.0, length, noise=2.0)
-    out, _ = whole(Settings(), Stream(grid_ns(9000), u, power, np.full(9000, 540.0)))
-    assert (out.kinds[3000:3900] == SETTLED_STEADY).mean() > 0.95
-    assert (out.kinds[4100:4390] == TRANSIENT).all()
-    kinds = {kind for *_, kind in spans(out.found)}
-    if length == 1500:
-        assert (out.kinds[4600:5400] == SETTLED_SLOPE).mean() > 0.95
-    else:
-        assert kinds == {SegmentKind.STEADY}
-
-
-@pytest.mark.parametrize('extra', range(-3, 4))
+@pytest.mark.parametrize('extra', [-1, 0, 1])
 @pytest.mark.parametrize('how', ['leap', 'nan'])
 def test_a_gap_right_where_the_longest_segment_is_cut_is_still_a_gap(extra, how):
     """The cut leaves nothing open; a gap at that very row must begin a transient all the same."""
@@ -419,28 +299,10 @@ def test_a_gap_right_where_the_longest_segment_is_cut_is_still_a_gap(extra, how)
     assert [s for s in spans(out.found) if s[0] >= first + SETTLE]
 
 
-def test_a_longer_hold_is_cut_and_goes_on_without_a_transient():
-    stream = Stream(*(a[:400] for a in plant(0, 400, hold=(400, 401)).part(0, 400)))
-    out, _ = whole(Settings(QUICK), stream)
-    found = spans(out.found)
-    assert [s[0] for s in found] == [SETTLE + 60 * k for k in range(len(found))]
-    assert len(found) == (400 - SETTLE) // 60
-    assert all(kind == SegmentKind.STEADY for *_, kind in found)
-
-
 # --- hostile --------------------------------------------------------------------------------
 
 
-def test_nothing_and_one_row():
-    segmenter = Segmenter(Settings())
-    empty = Stream(grid_ns(0), np.empty(0), np.empty(0), np.empty(0))
-    assert segmenter.feed(*empty.part(0, 0)).rows == 0
-    out = segmenter.feed(grid_ns(1), np.array([1.0]), np.array([2.0]), np.array([3.0]))
-    assert out.kinds.tolist() == [TRANSIENT]
-    assert out.found == []
-
-
-@pytest.mark.parametrize(('u', 'noise'), [(1500.0, 0.3), (1e6, 0.3), (-1e6, 0.3), (0.0, 0.0)])
+@pytest.mark.parametrize(('u', 'noise'), [(-1e6, 0.3), (0.0, 0.0)])
 def test_a_valve_that_never_moves_is_steady_with_no_slope(u, noise):
     n = 8000
     power = noise * (600.0 + np.random.default_rng(0).normal(0.0, 1.0, n))
@@ -466,42 +328,6 @@ def test_moves_are_found_when_the_valve_stood_still_most_of_the_time():
     later = [s for s in spans(out.found) if s[0] >= 20_000]
     assert any(kind == SegmentKind.SLOPE for *_, kind in later)
     assert any(kind == SegmentKind.STEADY for *_, kind in later)
-
-
-def test_time_reversed_every_row_is_a_gap():
-    stream = plant(0, 300)
-    stream.time_ns = stream.time_ns[::-1].copy()
-    out, _ = whole(Settings(QUICK), stream)
-    assert out.found == []
-    assert (out.kinds == TRANSIENT).all()
-
-
-@pytest.mark.parametrize('huge', [1e12, 1e154, 1e300])
-def test_huge_numbers_do_not_poison_what_comes_after(huge):
-    stream = plant(0, 300)
-    wild = Stream(*(a.copy() for a in stream.part(0, 300)))
-    wild.u[100:103] *= huge
-    segmenter = Segmenter(Settings(QUICK))
-    segmenter.feed(*wild.part(0, 300))
-    later = segmenter.feed(stream.time_ns + 10**13, stream.u, stream.power, stream.temperature)
-    expected, _ = whole(Settings(QUICK), stream)
-    assert later.kinds.tolist() == expected.kinds.tolist()
-    assert len([f for _, f in later.found if f.first_row >= 300]) == len(expected.found)
-
-
-@pytest.mark.parametrize('dtype', [np.float32, np.float64])
-def test_read_only_strided_and_single_precision_arrays(dtype):
-    stream = plant(0, 300)
-    wide = np.zeros((300, 5), dtype=dtype)
-    for c, column in enumerate(stream.part(0, 300)[1:]):
-        wide[:, c] = column
-    wide.setflags(write=False)
-    out = Segmenter(Settings(QUICK)).feed(stream.time_ns, wide[:, 0], wide[:, 1], wide[:, 2])
-    expected, _ = whole(Settings(QUICK), Stream(
-        stream.time_ns, *(np.ascontiguousarray(wide[:, c], dtype=np.float64) for c in range(3))
-    ))  # fmt: skip
-    assert spans(out.found) == spans(expected.found)
-    assert out.kinds.tolist() == expected.kinds.tolist()
 
 
 @pytest.mark.parametrize(('period', 'block'), [(0.1, 10.0), (60.0, 60.0)])

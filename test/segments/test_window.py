@@ -87,7 +87,7 @@ class NaiveWindow:
         return inside, spans
 
 
-@examples(300)
+@examples(200)
 @given(actions, st.sampled_from([20, 60, 333]), st.integers(0, 2**32 - 1))
 def test_after_every_append_the_window_holds_what_the_slow_truth_holds(plan, window_s, seed):
     rng = np.random.default_rng(seed)
@@ -131,6 +131,8 @@ def test_after_every_append_the_window_holds_what_the_slow_truth_holds(plan, win
         held = fast.contents()
         assert fast.numbers().tolist() == [r[0] for r in rows]
         assert held.time_ns.tolist() == [r[1] for r in rows]
+        span_s = (rows[-1][1] - rows[0][1]) / NS_PER_S + 1.0 if rows else 0.0
+        assert fast.span_s == span_s
         for c, column in enumerate((held.u, held.power_mw, held.temperature_degc), start=2):
             assert np.array_equal(column, [r[c] for r in rows], equal_nan=True)
         assert held.spans.tolist() == spans
@@ -154,20 +156,6 @@ def test_the_tail_is_the_newest_rows(plan, wanted):
     newest = window.tail(wanted)[1]
     assert newest.tolist() == (seen[-len(newest) :] if len(newest) else [])
     assert len(newest) >= min(wanted, len(seen), 101)
-
-
-def test_counters_follow_segments_out_of_the_window():
-    window = RollingWindow(100.0, 1.0)
-    time_ns = rows_after(START_NS, 60)
-    window.append(time_ns, *np.zeros((3, 60)))
-    window.add_segment(segment(1, 10, 30, int(time_ns[10])))
-    window.add_segment(segment(2, 40, 55, int(time_ns[40])))
-    assert (window.segments, window.special_samples) == (2, 35)
-    more = rows_after(int(time_ns[-1]), 60)
-    window.append(more, *np.zeros((3, 60)))
-    assert (window.segments, window.special_samples) == (1, 15)
-    window.append(rows_after(int(more[-1]), 60), *np.zeros((3, 60)))
-    assert (window.segments, window.special_samples) == (0, 0)
 
 
 @pytest.mark.parametrize('least_s', [None, 60.0, 61.0])
@@ -196,13 +184,8 @@ def test_a_segment_that_a_step_of_the_clock_cuts_goes_on_to_there_in_its_line(le
     (cut,) = window.special_segments()
     assert (cut.number, cut.kind, cut.start_ns) == (7, SegmentKind.SLOPE, int(time_ns[0]))
     assert (cut.samples, cut.end_ns) == (60, int(time_ns[59]))
-    ends = (
-        cut.u_start,
-        cut.u_end,
-        cut.power_end_mw,
-        cut.opening_end_percent,
-        cut.pressure_end_mpa,
-    )
+    ends = (cut.u_start, cut.u_end, cut.power_end_mw, cut.opening_end_percent,
+            cut.pressure_end_mpa)  # fmt: skip
     np.testing.assert_allclose(ends, (320.0, 16.0 * 25.9, 5.0 * 59.0, 25.9, 16.0))
     # Should the clock have been wrong only for a moment, it is whole again.
     later = rows_after(int(time_ns[-1]), 5)
@@ -228,16 +211,6 @@ def test_a_run_that_begins_again_and_again_is_the_last_one():
     assert window.contents().u.tolist() == [5.0] * 2490 + [6.0] * 10
 
 
-def test_a_gap_where_the_first_run_ended_is_no_return():
-    window = RollingWindow(86400.0, 1.0)
-    feed(window, 10, 1810, 1)
-    window.go_back(10 * NS_PER_S)
-    feed(window, 10, 700, 2)
-    feed(window, 701, 1809, 2)
-    feed(window, 1811, 1820, 3)
-    assert window.contents().u.tolist() == [2.0] * 1798 + [3.0] * 9
-
-
 def test_memory_is_bounded_however_long_it_runs():
     window = RollingWindow(1000.0, 1.0)
     last = START_NS
@@ -247,32 +220,3 @@ def test_memory_is_bounded_however_long_it_runs():
         last = int(time_ns[-1])
         assert len(window) <= 1000 * 5 // 4 + 20
     assert len(window.contents().time_ns) == 1000
-
-
-def test_contents_are_a_copy():
-    window = RollingWindow(100.0, 1.0)
-    time_ns = rows_after(START_NS, 10)
-    window.append(time_ns, *np.ones((3, 10)))
-    held = window.contents()
-    window.append(rows_after(int(time_ns[-1]), 500), *np.zeros((3, 500)))
-    assert held.u.tolist() == [1.0] * 10
-    assert held.time_ns.tolist() == time_ns.tolist()
-
-
-def test_an_empty_window_has_empty_contents():
-    window = RollingWindow(100.0, 1.0)
-    window.append(np.empty(0, dtype=np.int64), *np.empty((3, 0)))
-    held = window.contents()
-    assert len(held.time_ns) == len(held.u) == 0
-    assert held.spans.shape == (0, 3)
-    assert len(held.special_rows()) == 0
-    assert held.count(SegmentKind.SLOPE) == 0
-
-
-def test_columns_in_single_precision_and_read_only_are_taken():
-    window = RollingWindow(100.0, 1.0)
-    column = np.full(5, 1.5, dtype=np.float32)
-    column.setflags(write=False)
-    window.append(rows_after(START_NS, 5), column, column, column)
-    assert window.contents().u.dtype == np.float64
-    assert window.contents().power_mw == pytest.approx(1.5)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -26,6 +25,7 @@ from valveflow_ros.baselines.judged import (
 from valveflow_ros.baselines.sparse import NAMES, SparseFit, fit_sparse
 from valveflow_ros.baselines.truth import CurveError, Line, Truth, curve_error
 from valveflow_ros.curve.characteristic import Characteristic, Piece
+from valveflow_ros.curve.characteristic_json import number
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.records import FloatArray, SegmentKind
@@ -66,30 +66,16 @@ class Finding(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two predictions compared.
-
-    Attributes
-    ----------
-    terms : Terms
-    ours, theirs : str
-        Names of the predictions.
-    mse_ours_mw2, mse_theirs_mw2 : float
-    test : PairedTest
-        Of the difference of squared errors, theirs minus ours, over segments or blocks.
-    failed : int
-        Number of segments or blocks in which theirs is not finite; the test omits them.
-    judged : int
-        Number of all segments or blocks, including the failed ones.
-    """
+    """Two predictions compared."""
 
     terms: Terms
-    ours: str
+    ours: str  # names of the predictions
     theirs: str
     mse_ours_mw2: float
     mse_theirs_mw2: float
-    test: PairedTest
-    failed: int = 0
-    judged: int = 0
+    test: PairedTest  # of squared errors, theirs minus ours, over segments or blocks
+    failed: int = 0  # segments or blocks in which theirs is not finite; the test omits them
+    judged: int = 0  # all segments or blocks
 
     @property
     def baseline(self) -> str:
@@ -130,14 +116,12 @@ def pairs_on_segments(
     found = []
     for terms, ours, theirs in met:
         kind = SegmentKind.STEADY if terms is Terms.STATIC else None
-        if ours in predictions and theirs in predictions and judgement.kinds(kind):
-            found.append(
-                Pair(
-                    terms, ours, theirs, judgement.mse(ours, kind), judgement.mse(theirs, kind),
-                    judgement.gain(ours, theirs, kind), judgement.failed(theirs, kind),
-                    len(judgement.kinds(kind)),
-                )
-            )  # fmt: skip
+        count = len(judgement.kinds(kind))
+        if ours in predictions and theirs in predictions and count:
+            found.append(Pair(
+                terms, ours, theirs, judgement.mse(ours, kind), judgement.mse(theirs, kind),
+                judgement.gain(ours, theirs, kind), judgement.failed(theirs, kind), count,
+            ))  # fmt: skip
     return tuple(found)
 
 
@@ -146,18 +130,14 @@ def everywhere(
 ) -> tuple[dict[str, float], tuple[Pair, ...]]:
     """Compare simulations on all rows, with tests over blocks of half an hour.
 
-    Returns
-    -------
-    dict
-        Mean squared error in MW^2 of each simulation.
-    tuple of Pair
+    Return the mean squared error in MW^2 of each simulation, and the pairs.
     """
-    names = [n for n in predictions if n.endswith('.dynamic')]
     good = trial.good
-    squares = {}
-    for name in names:
-        with np.errstate(over='ignore', invalid='ignore'):
-            squares[name] = (trial.power_mw - predictions[name])[good] ** 2
+    with np.errstate(over='ignore', invalid='ignore'):
+        squares = {
+            name: (trial.power_mw - predicted)[good] ** 2
+            for name, predicted in predictions.items() if name.endswith('.dynamic')
+        }  # fmt: skip
     mse = {name: float(np.mean(s)) if len(s) else float('nan') for name, s in squares.items()}
     ours = 'proposed.dynamic'
     if ours not in squares:
@@ -172,10 +152,10 @@ def everywhere(
         finite = np.isfinite(sums)
         rows = counts[there][finite]
         test = over_blocks(sums[finite] / rows.mean() if len(rows) else np.empty(0))
-        failed = int((~finite).sum())
-        pairs.append(
-            Pair(Terms.ALL_ROWS, ours, theirs, mse[ours], mse[theirs], test, failed, len(sums))
-        )
+        pairs.append(Pair(
+            Terms.ALL_ROWS, ours, theirs, mse[ours], mse[theirs], test, int((~finite).sum()),
+            len(sums),
+        ))  # fmt: skip
     return mse, tuple(pairs)
 
 
@@ -201,8 +181,6 @@ class Comparison:
     ----------
     characteristic : Characteristic
         The curve of the proposed method.
-    hammerstein : HammersteinFit
-    sparse : SparseFit or None
     failure : str
         Why there is no sparse model; empty if there is one.
     lines : mapping of Line
@@ -210,15 +188,10 @@ class Comparison:
         paper fits it), 'proposed' (this program's) and 'hammerstein'.
     predictions : mapping of float64 (n,)
         For the other data, in MW: the '.static' curve and '.dynamic' simulation of each method.
-    trial : Trial
-    judgement : Judgement
     all_rows : mapping
         Mean squared error in MW^2 of the simulations over all rows that can be used.
-    pairs : tuple of Pair
-        The pairwise comparisons.
     errors : mapping of CurveError
         Errors relative to the truth, by method; empty if it is unknown.
-    truth : Truth or None
     """
 
     characteristic: Characteristic
@@ -247,21 +220,15 @@ class Comparison:
 
 
 def compare(
-    learn: Samples,
-    characteristic: Characteristic,
-    other: OtherData,
-    truth: Truth | None = None,
-    progress: Progress = lambda _share, _what: None,
-) -> Comparison:
+    learn: Samples, characteristic: Characteristic, other: OtherData,
+    truth: Truth | None = None, progress: Progress = lambda _share, _what: None,
+) -> Comparison:  # fmt: skip
     """Identify with the two methods of the literature and test all methods on other data.
 
     Parameters
     ----------
     learn : Samples
         The rows from which ``characteristic`` was identified; the other methods use all of them.
-    characteristic : Characteristic
-    other : OtherData
-    truth : Truth, optional
 
     Raises
     ------
@@ -292,19 +259,11 @@ def compare(
     judgement = judge(trial, predictions)
     all_rows, rows_pairs = everywhere(trial, predictions)
     return Comparison(
-        characteristic=characteristic,
-        hammerstein=hammerstein,
-        sparse=sparse,
-        failure=failure,
-        lines=lines,
-        predictions=predictions,
-        trial=trial,
-        judgement=judgement,
-        all_rows=all_rows,
+        characteristic=characteristic, hammerstein=hammerstein, sparse=sparse, failure=failure,
+        lines=lines, predictions=predictions, trial=trial, judgement=judgement, all_rows=all_rows,
         pairs=(*pairs_on_segments(judgement, predictions), *rows_pairs),
-        errors=_errors(characteristic, lines, sparse, truth),
-        truth=truth,
-    )
+        errors=_errors(characteristic, lines, sparse, truth), truth=truth,
+    )  # fmt: skip
 
 
 def _lines(characteristic: Characteristic, hammerstein: HammersteinFit) -> dict[str, Line]:
@@ -316,12 +275,9 @@ def _lines(characteristic: Characteristic, hammerstein: HammersteinFit) -> dict[
 
 
 def _predictions(
-    characteristic: Characteristic,
-    lines: Mapping[str, Line],
-    hammerstein: HammersteinFit,
-    sparse: SparseFit | None,
-    samples: Samples,
-) -> dict[str, FloatArray]:
+    characteristic: Characteristic, lines: Mapping[str, Line], hammerstein: HammersteinFit,
+    sparse: SparseFit | None, samples: Samples,
+) -> dict[str, FloatArray]:  # fmt: skip
     """Return the curve of each method at the input, and its simulation."""
     found = {f'{name}.static': line(samples.u) for name, line in lines.items()}
     if characteristic.dynamics:
@@ -369,13 +325,10 @@ def to_json(c: Comparison) -> dict[str, Any]:
         'methods': _methods_json(c),
         'pairs': [
             {
-                'terms': p.terms.value,
-                'ours': p.ours,
-                'theirs': p.theirs,
+                'terms': p.terms.value, 'ours': p.ours, 'theirs': p.theirs,
                 'mse_ours_mw2': number(p.mse_ours_mw2),
                 'mse_theirs_mw2': number(p.mse_theirs_mw2),
-                'theirs_less_ours': fields_json(p.test),
-                'segments_not_finite': p.failed,
+                'theirs_less_ours': fields_json(p.test), 'segments_not_finite': p.failed,
                 'ours_is': p.outcome.value,
             }
             for p in c.pairs
@@ -431,14 +384,6 @@ def _methods_json(c: Comparison) -> dict[str, Any]:
         ],
     }  # fmt: skip
     return methods
-
-
-# Common parts of the JSON of a comparison and of a validation.
-
-
-def number(value: float) -> float | None:
-    """Return a number for JSON; None for NaN and infinity, which JSON does not have."""
-    return float(value) if math.isfinite(value) else None
 
 
 def fields_json(value: Any, **renamed: str) -> dict[str, Any]:

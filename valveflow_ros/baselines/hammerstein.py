@@ -100,15 +100,9 @@ def run_with_tangents(
 ) -> None:  # fmt: skip
     """Write means over ``group`` rows of the simulated power and of its derivatives.
 
-    Parameters
-    ----------
-    u, usable : (n,)
-    knots, values : (J + 1,)
-    b : (n_b,), f : (n_f,)
-    answer : (m,), jacobian : (m, P), weight : (m,)
-        Outputs. P = (J + 1) + (J - 1) + n_f + (n_b - 1): values, inner knots, f, b_1 and following
-        (or only the first columns of these). ``weight`` is 1 if all rows of the mean are usable
-        and settled.
+    Outputs are ``answer`` (m,), ``jacobian`` (m, P) and ``weight`` (m,), which is 1 if all rows of
+    the mean are usable and settled. P = (J + 1) + (J - 1) + n_f + (n_b - 1): values, inner knots,
+    f, b_1 and following, or only the first columns of these.
     """
     columns = jacobian.shape[1]
     n_curve = 2 * (knots.size - 1)
@@ -149,28 +143,13 @@ def run_with_tangents(
 
 @dataclass(frozen=True, slots=True)
 class HammersteinModel:
-    """Curve F of eq. (2) without jumps, and one discrete transfer function of static gain 1.
+    """Curve F of eq. (2) without jumps, and one discrete transfer function of static gain 1."""
 
-    Attributes
-    ----------
-    knots : float64 (J + 1,)
-        % MPa^m; the outer pieces extend beyond the outer ones.
-    values : float64 (J + 1,)
-        MW at the knots.
-    numerator : float64 (n_b - 1,)
-        b_1 and following; b_0 makes the static gain 1.
-    denominator : float64 (n_f,)
-        f_1 and following, after the leading 1.
-    delay : int
-        Delay in rows.
-    step_s : float
-    """
-
-    knots: FloatArray
-    values: FloatArray
-    numerator: FloatArray
-    denominator: FloatArray
-    delay: int
+    knots: FloatArray  # (J + 1,) % MPa^m; the outer pieces extend beyond the outer ones
+    values: FloatArray  # (J + 1,) MW at the knots
+    numerator: FloatArray  # (n_b - 1,) b_1 and following; b_0 makes the static gain 1
+    denominator: FloatArray  # (n_f,) f_1 and following, after the leading 1
+    delay: int  # rows
     step_s: float
 
     @property
@@ -255,10 +234,7 @@ def tangents(
 ) -> tuple[FloatArray, FloatArray, ByteArray]:
     """Return residual means (m,), Jacobian of the simulation (m, P) and weight (m,).
 
-    Parameters
-    ----------
-    columns : int, optional
-        Number of first derivatives to compute; default all.
+    ``columns`` is the number of first derivatives to compute; default all.
     """
     answer, jacobian, weight = model.averaged(samples, columns)
     power = samples.power_mw[: samples.means * samples.group]
@@ -289,10 +265,8 @@ def move(
 ) -> tuple[HammersteinModel, float]:
     """Fit values, knots and both polynomials by Levenberg-Marquardt with a fixed delay.
 
-    Parameters
-    ----------
-    ar : float64 (k,)
-        AR model of the noise of the means; empty for the output error model (white noise).
+    ``ar`` (k,) is an AR model of the noise of the means; empty for the output error model (white
+    noise).
     """
 
     def cost(model: HammersteinModel) -> float:
@@ -346,17 +320,6 @@ def knots_to_try(u: FloatArray, pieces: int) -> list[FloatArray]:
     return tried if pieces > 1 else tried[:1]
 
 
-def first_order(
-    knots: FloatArray, time_constant_s: float, delay_s: float, step_s: float
-) -> HammersteinModel:
-    """Return a model with one pole and a flat curve."""
-    return HammersteinModel(
-        knots=knots, values=np.zeros(len(knots)), numerator=np.empty(0),
-        denominator=np.array([-np.exp(-step_s / time_constant_s)]),
-        delay=round(delay_s / step_s), step_s=step_s,
-    )  # fmt: skip
-
-
 def with_best_values(samples: Samples, model: HammersteinModel) -> tuple[HammersteinModel, float]:
     """Return the model with the values at the knots that fit best, and its squared error.
 
@@ -372,38 +335,29 @@ def with_best_values(samples: Samples, model: HammersteinModel) -> tuple[Hammers
 
 
 def starts(samples: Samples, pieces: int) -> list[HammersteinModel]:
-    """Return the best model of the (T, tau) grid for each set of knots, best first.
-
-    Parameters
-    ----------
-    samples : Samples
-        May be averaged rows.
-    """
-    u = samples.u[samples.usable > 0]
+    """Return the best model of the (T, tau) grid for each set of knots, best first."""
+    u, step_s = samples.u[samples.usable > 0], samples.step_s
     found = []
     for knots in knots_to_try(u, pieces):
-        tried = [
-            with_best_values(samples, first_order(knots, t, d, samples.step_s))
+        first_order = (
+            HammersteinModel(
+                knots, np.zeros(len(knots)), np.empty(0), np.array([-np.exp(-step_s / t)]),
+                round(d / step_s), step_s,
+            )
             for t in _GRID_T_S for d in _GRID_DELAY_S
-        ]  # fmt: skip
+        )  # fmt: skip
+        tried = [with_best_values(samples, model) for model in first_order]
         found.append(min(tried, key=lambda pair: pair[1]))
     return [model for model, _ in sorted(found, key=lambda pair: pair[1])]
 
 
 @dataclass(frozen=True, slots=True)
 class HammersteinFit:
-    """The model and the evidence for its choice.
-
-    Attributes
-    ----------
-    model : HammersteinModel
-    noise : str
-        'output error' or 'autoregressive'.
-    tried : tuple of (n_b, n_f, noise, mean squared error in MW^2 on the held-out part)
-    """
+    """The model and the evidence for its choice."""
 
     model: HammersteinModel
-    noise: str
+    noise: str  # 'output error' or 'autoregressive'
+    # (n_b, n_f, noise, mean squared error in MW^2 on the held-out part)
     tried: tuple[tuple[int, int, str, float], ...]
 
 
@@ -423,11 +377,9 @@ def fit_hammerstein(
     progress('Hammerstein model: orders')
     candidates = _orders(learn, coarse)
     tried = [(len(m.b), len(m.denominator), noise, run_mse(m, judge)) for noise, m in candidates]
-    best = int(np.argmin([t[-1] for t in tried]))
-    noise, model = candidates[best]
+    noise, model = candidates[int(np.argmin([t[-1] for t in tried]))]
     progress('Hammerstein model: all data')
-    model = _on_all(samples, model, noise)
-    return HammersteinFit(model, noise, tuple(tried))
+    return HammersteinFit(_on_all(samples, model, noise), noise, tuple(tried))
 
 
 def _at_coarse(samples: Samples, pieces: int) -> HammersteinModel:
@@ -470,7 +422,6 @@ def grown(model: HammersteinModel, n_b: int, n_f: int) -> HammersteinModel:
 
 
 def _on_all(samples: Samples, model: HammersteinModel, noise: str) -> HammersteinModel:
-    """Refit on all rows."""
     u = samples.u[samples.usable > 0]
     knots = model.knots.copy()
     knots[0], knots[-1] = min(knots[0], u.min()), max(knots[-1], u.max())

@@ -38,15 +38,8 @@ _LEAST_OF_PART = 0.1  # fraction of the required settled rows, in each part
 class PairedTest:
     """A t test of a mean difference against zero.
 
-    Attributes
-    ----------
-    mean : float
-    stderr : float
-    t : float
-    p_value : float
-        Two-sided.
-    effective : float
-        Effective number of independent values; the degrees of freedom are one less.
+    The p-value is two-sided; the degrees of freedom are one less than the ``effective`` number of
+    independent values.
     """
 
     mean: float
@@ -81,16 +74,8 @@ def _test(mean: float, stderr: float, effective: float) -> PairedTest:
 def over_samples(difference: FloatArray, widening: float = 1.0) -> PairedTest:
     """Test the samples of a segment; by default all are independent, as in the paper.
 
-    Parameters
-    ----------
-    difference : float64 (n,)
-    widening : float
-        Ratio of the variance of a long mean to that of independent samples: the
-        effective number of samples is n / widening.
-
-    Notes
-    -----
-    The result is NaN if the effective number is below two.
+    ``widening`` is the ratio of the variance of a long mean to that of independent samples: the
+    effective number of samples is n / widening. The result is NaN if it is below two.
     """
     n = len(difference)
     effective = n / max(widening, 1.0)
@@ -103,15 +88,9 @@ def over_samples(difference: FloatArray, widening: float = 1.0) -> PairedTest:
 def over_blocks(blocks: FloatArray) -> PairedTest:
     """Test means of blocks, allowing for correlation from block to block.
 
-    Parameters
-    ----------
-    blocks : float64 (k,)
-        One value per block (for example a segment), in chronological order.
-
-    Notes
-    -----
-    The variance is that of Newey and West with Bartlett weights over
-    ``4 (k / 100)^(2/9)`` lags, but at least the ordinary variance.
+    There is one value per block (for example a segment), in chronological order. The variance is
+    that of Newey and West with Bartlett weights over ``4 (k / 100)^(2/9)`` lags, but at least the
+    ordinary variance.
     """
     k = len(blocks)
     if k < 2:
@@ -130,19 +109,10 @@ def over_blocks(blocks: FloatArray) -> PairedTest:
 def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
     """Return the factor by which correlation in time increases the variance of a mean.
 
-    Parameters
-    ----------
-    residual : float64 (n,)
-    spans : int64 (k, 2)
-        First and end row of the stretches to use; rows of different stretches are
-        not neighbours.
-    step_s : float
-
-    Notes
-    -----
-    The stretches are pooled with a common mean: with its own mean each would seem less
-    correlated than it is. A misfit that changes from stretch to stretch is therefore
-    taken as correlation, which is conservative.
+    The spans (k, 2) are the first and end rows of the stretches to use, which are no neighbours.
+    They are pooled with a common mean: with its own mean each would seem less correlated than it
+    is. A misfit that changes from stretch to stretch is therefore taken as correlation, which is
+    conservative.
     """
     if not len(spans):
         return 1.0
@@ -158,24 +128,13 @@ def widening_of(residual: FloatArray, spans: IntArray, step_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class OtherData:
-    """Data that no method has used for fitting.
-
-    Attributes
-    ----------
-    samples : Samples
-    time_ns : int64 (n,)
-    spans : int64 (k, 3)
-        Special segments as first row, end row and kind.
-    opening_percent : float64 (n,), optional
-    exponent : float
-        m of the u = V p^m of the samples.
-    """
+    """Data that no method has used for fitting."""
 
     samples: Samples
-    time_ns: IntArray
-    spans: IntArray
-    opening_percent: FloatArray | None = None
-    exponent: float = PAPER_EXPONENT
+    time_ns: IntArray  # (n,)
+    spans: IntArray  # (k, 3) special segments as first row, end row and kind
+    opening_percent: FloatArray | None = None  # (n,)
+    exponent: float = PAPER_EXPONENT  # m of the u = V p^m of the samples
 
     def on_axis(self, form: StaticForm) -> OtherData:
         """Return the data with the u and the p^e of a curve of this form.
@@ -203,90 +162,47 @@ class OtherData:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Measured data for the test.
+    """Measured data for the test."""
 
-    Attributes
-    ----------
-    time_ns : int64 (n,)
-    u, power_mw : float64 (n,)
-    good : bool (n,)
-        Rows used for the test of every prediction: measured, inside the identified range
-        of u, and far enough after a gap.
-    spans : int64 (k, 3)
-        Special segments as first row, end row and kind.
-    step_s : float
-    """
-
-    time_ns: IntArray
-    u: FloatArray
-    power_mw: FloatArray
+    time_ns: IntArray  # (n,)
+    u: FloatArray  # (n,)
+    power_mw: FloatArray  # (n,)
+    # (n,) rows used for the test of every prediction: measured, inside the identified range of u,
+    # and far enough after a gap.
     good: BoolArray
-    spans: IntArray
+    spans: IntArray  # (k, 3) special segments as first row, end row and kind
     step_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """The error of one prediction on one segment.
+    """The error, measured minus predicted, of one prediction on one segment."""
 
-    Attributes
-    ----------
-    mse_mw2 : float
-        Mean squared error; not finite if the prediction is not.
-    samples : PairedTest
-        Of measured minus predicted, with independent samples, as in the paper.
-    effective : PairedTest
-        The same with the effective number of samples.
-    """
-
-    mse_mw2: float
-    samples: PairedTest
-    effective: PairedTest
+    mse_mw2: float  # not finite if the prediction is not
+    samples: PairedTest  # with independent samples, as in the paper
+    effective: PairedTest  # with the effective number of samples
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedSegment:
-    """One special segment of the other data.
+    """One special segment of the other data."""
 
-    Attributes
-    ----------
-    number : int
-        From 1, in chronological order.
-    kind : SegmentKind
-    start_ns, end_ns : int
-    rows : int64 (m,)
-        Indices of the rows that were used.
-    power_mw : float
-        Mean measured power.
-    scores : mapping
-        Scores by prediction.
-    """
-
-    number: int
+    number: int  # from 1, in chronological order
     kind: SegmentKind
     start_ns: int
     end_ns: int
-    rows: IntArray
-    power_mw: float
-    scores: Mapping[str, Score]
+    rows: IntArray  # indices of the rows that were used
+    power_mw: float  # mean of the measured power
+    scores: Mapping[str, Score]  # by prediction
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """The test of all segments.
-
-    Attributes
-    ----------
-    segments : tuple of JudgedSegment
-    widening : float
-        Number of samples equivalent to one independent sample.
-    outside : int
-        Number of omitted samples of special segments: outside the curve, or too near a gap.
-    """
+    """The test of all segments."""
 
     segments: tuple[JudgedSegment, ...]
-    widening: float
-    outside: int
+    widening: float  # number of samples equivalent to one independent sample
+    outside: int  # omitted samples of special segments: outside the curve, or too near a gap
 
     @property
     def samples(self) -> int:
@@ -341,13 +257,7 @@ def _weighted(pairs: list[tuple[int, float]]) -> PairedTest:
 
 
 def judge(trial: Trial, predictions: Mapping[str, FloatArray]) -> Judgement:
-    """Test predictions on the special segments of other data.
-
-    Parameters
-    ----------
-    trial : Trial
-    predictions : mapping of float64 (n,)
-        MW, by name.
+    """Test predictions (n,) in MW on the special segments of other data.
 
     Raises
     ------
@@ -366,12 +276,10 @@ def judge(trial: Trial, predictions: Mapping[str, FloatArray]) -> Judgement:
     for number, (a, b, kind, rows) in enumerate(kept, 1):
         measured = trial.power_mw[rows]
         scores = {k: _score(measured - p[rows], widening) for k, p in predictions.items()}
-        segments.append(
-            JudgedSegment(
-                number, SegmentKind(int(kind)), int(trial.time_ns[a]), int(trial.time_ns[b - 1]),
-                rows, float(measured.mean()), scores,
-            )
-        )  # fmt: skip
+        segments.append(JudgedSegment(
+            number, SegmentKind(int(kind)), int(trial.time_ns[a]), int(trial.time_ns[b - 1]),
+            rows, float(measured.mean()), scores,
+        ))  # fmt: skip
     return Judgement(tuple(segments), widening, outside)
 
 
@@ -421,12 +329,9 @@ def samples_of(contents: WindowContents, settings: Settings) -> Samples:
     usable[1:][np.diff(contents.time_ns) > 1.5e9 * step_s] = 0
     return Samples(
         u=np.where(usable > 0, contents.u, 0.0),
-        power_mw=np.where(usable > 0, contents.power_mw, 0.0),
-        usable=usable,
-        step_s=step_s,
-        settle_s=settings.settle_s,
-        group=max(1, round(settings.real('block') / step_s)),
-    )
+        power_mw=np.where(usable > 0, contents.power_mw, 0.0), usable=usable, step_s=step_s,
+        settle_s=settings.settle_s, group=max(1, round(settings.real('block') / step_s)),
+    )  # fmt: skip
 
 
 def other_data(contents: WindowContents, settings: Settings) -> OtherData:

@@ -35,30 +35,16 @@ _AWAY = 1e6  # MW; a larger solution has diverged
 
 
 @jit
-def theta(y: float, u: float, out: FloatArray) -> None:
-    """Write the 14 functions at one point."""
-    out[0] = 1.0
-    out[1] = y
-    out[2] = u
-    out[3] = y * y
-    out[4] = y * u
-    out[5] = u * u
-    out[6] = y * y * y
-    out[7] = y * y * u
-    out[8] = y * u * u
-    out[9] = u * u * u
-    out[10] = math.sin(y)
-    out[11] = math.sin(u)
-    out[12] = math.cos(y)
-    out[13] = math.cos(u)
-
-
-@jit
 def columns(y: FloatArray, u: FloatArray) -> FloatArray:
-    """Return the functions at all rows, shape (n, 14)."""
+    """Return the 14 functions at all rows, shape (n, 14)."""
     out = np.empty((y.size, SIZE))
     for t in range(y.size):
-        theta(y[t], u[t], out[t])
+        a, b = y[t], u[t]
+        out[t, 0], out[t, 1], out[t, 2] = 1.0, a, b
+        out[t, 3], out[t, 4], out[t, 5] = a * a, a * b, b * b
+        out[t, 6], out[t, 7], out[t, 8], out[t, 9] = a * a * a, a * a * b, a * b * b, b * b * b
+        out[t, 10], out[t, 11] = math.sin(a), math.sin(b)
+        out[t, 12], out[t, 13] = math.cos(a), math.cos(b)
     return out
 
 
@@ -161,21 +147,10 @@ _GRID = 1500  # number of points for the search of a change of sign
 
 @dataclass(frozen=True, slots=True)
 class SparseModel:
-    """y' = xi . theta(y, u).
+    """y' = xi . theta(y, u)."""
 
-    Attributes
-    ----------
-    xi : float64 (14,)
-        MW/s per unit of each function; 0 if the function is absent.
-    u_from, u_to, power_from, power_to : float
-        The range of the data used for the fit.
-    power_mean : float
-        The mean power of these data.
-    step_s : float
-    """
-
-    xi: FloatArray
-    u_from: float
+    xi: FloatArray  # (14,) MW/s per unit of each function; 0 if the function is absent
+    u_from: float  # the range of the data used for the fit
     u_to: float
     power_from: float
     power_to: float
@@ -256,17 +231,9 @@ _STEEP = 4  # phi = (1 - s^2)^4, whose derivative is also zero at the ends
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """The method for the derivatives in the equations.
+    """The method for the derivatives in the equations."""
 
-    Attributes
-    ----------
-    kind : str
-        'derivative' or 'weak'.
-    window_s : float
-        Width of the window.
-    """
-
-    kind: str
+    kind: str  # 'derivative' or 'weak'
     window_s: float
 
 
@@ -332,22 +299,13 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class SparseFit:
-    """The model and the evidence for its choice.
-
-    Attributes
-    ----------
-    model : SparseModel
-    form : Form
-        The method for the derivatives.
-    threshold : float
-        Threshold of the coefficients of scaled columns.
-    mse_by_form : tuple of (kind, window in s, functions, mean squared error in MW^2)
-        The best result of each form on the held-out part.
-    """
+    """The model and the evidence for its choice."""
 
     model: SparseModel
     form: Form
-    threshold: float
+    threshold: float  # of the coefficients of scaled columns
+    # The best result of each form on the held-out part: kind, window in s, functions, mean squared
+    # error in MW^2.
     mse_by_form: tuple[tuple[str, float, int, float], ...]
 
 
@@ -360,18 +318,10 @@ class _Candidate:
 
 
 def thresholded(theta: FloatArray, target: FloatArray, threshold: float) -> FloatArray:
-    """Solve by sequentially thresholded least squares.
+    """Solve theta (k, P) xi (P,) = target (k,) by sequentially thresholded least squares.
 
-    Parameters
-    ----------
-    theta : float64 (k, P)
-    target : float64 (k,)
-    threshold : float
-        Smaller coefficients are set to zero and the others are refitted until nothing changes.
-
-    Returns
-    -------
-    float64 (P,)
+    Coefficients below the threshold are set to zero and the others are refitted until nothing
+    changes.
     """
     kept = np.ones(theta.shape[1], dtype=bool)
     xi = np.zeros(theta.shape[1])
@@ -427,8 +377,7 @@ def fit_sparse(samples: Samples, progress: Progress = lambda _: None) -> SparseF
     model = _on_support(samples, *_triangle(equations(samples, chosen.form)), chosen.support)
     best_of: dict[Form, _Candidate] = {}
     for c in candidates:
-        if c.form not in best_of or c.mse < best_of[c.form].mse:
-            best_of[c.form] = c
+        best_of[c.form] = min(best_of.get(c.form, c), c, key=lambda each: each.mse)
     tried = tuple((f.kind, f.window_s, int(c.support.sum()), c.mse) for f, c in best_of.items())
     return SparseFit(model, chosen.form, chosen.threshold, tried)
 
@@ -451,7 +400,6 @@ def _of_form(learn: Samples, judge: Samples, form: Form) -> list[_Candidate]:
 def _on_support(
     samples: Samples, triangle: FloatArray, scale: FloatArray, support: BoolArray
 ) -> SparseModel:
-    """Fit the functions of a support."""
     xi = np.zeros(SIZE)
     xi[support] = np.linalg.lstsq(triangle[:, :-1][:, support], triangle[:, -1], rcond=None)[0]
     xi *= scale[-1] / scale[:-1]

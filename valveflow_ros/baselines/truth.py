@@ -20,17 +20,11 @@ _PLACES = 2000
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A piecewise-linear curve.
+    """A piecewise-linear curve."""
 
-    Attributes
-    ----------
-    knots : float64 (J + 1,)
-    slopes, intercepts : float64 (J,)
-    """
-
-    knots: FloatArray
-    slopes: FloatArray
-    intercepts: FloatArray
+    knots: FloatArray  # (J + 1,)
+    slopes: FloatArray  # (J,)
+    intercepts: FloatArray  # (J,)
 
     def __call__(self, u: FloatArray) -> FloatArray:
         """Evaluate F; the outer pieces are extended."""
@@ -47,21 +41,12 @@ class Truth(Line):
 
 @dataclass(frozen=True, slots=True)
 class CurveError:
-    """The error of a curve relative to the true one, between two inputs.
-
-    Attributes
-    ----------
-    rmse_mw, largest_mw : float
-    known : float
-        Fraction of the range in which the curve is defined; the errors refer to it.
-    slope, knee, intercept : float
-        Largest errors of the parameters, NaN unless the number of pieces is right.
-    """
+    """The error of a curve relative to the true one, between two inputs."""
 
     rmse_mw: float
     largest_mw: float
-    known: float
-    slope: float = math.nan
+    known: float  # fraction of the range in which the curve is defined; the errors refer to it
+    slope: float = math.nan  # largest errors of the parameters, if the number of pieces is right
     knee: float = math.nan
     intercept: float = math.nan
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.baselines.comparison import fields_json, judged_json, number, totals_json
+from valveflow_ros.baselines.comparison import fields_json, judged_json, totals_json
 from valveflow_ros.baselines.judged import (
     Judgement,
     OtherData,
@@ -23,6 +23,7 @@ from valveflow_ros.baselines.judged import (
     trial_of,
 )
 from valveflow_ros.curve.characteristic import Characteristic
+from valveflow_ros.curve.characteristic_json import number
 from valveflow_ros.fit.model_form import Misfit, find_misfit
 from valveflow_ros.records import FloatArray
 from valveflow_ros.signals.static_form import pressure_of
@@ -47,14 +48,8 @@ class Verdict(enum.Enum):
 class PieceCheck:
     """The mean of measured minus predicted power on one piece of the curve.
 
-    Attributes
-    ----------
-    u_from, u_to : float
-    segments, samples : int
-    test : PairedTest
-        Over segments, allowing for correlation between them.
-    low_mw, high_mw : float
-        Interval of the mean at 95 % confidence for all pieces together; NaN if unknown.
+    The test is over segments, allowing for correlation between them. The interval of the mean is
+    that at 95 % confidence for all pieces together; NaN if unknown.
     """
 
     u_from: float
@@ -80,20 +75,11 @@ class Validation:
 
     Attributes
     ----------
-    characteristic : Characteristic
-    against : Characteristic or None
     judged_by : str
         The prediction used for the verdict: the simulation if the dynamics are known,
         else the curve.
-    tolerance_mw : float
-    trial : Trial
-    predictions : mapping of float64 (n,)
-    judgement : Judgement
     outside_share : float
         Fraction of the special samples with u outside the range of the curve.
-    overall : PieceCheck
-    pieces : tuple of PieceCheck
-    verdict : Verdict
     misfit : Misfit or None
         The error of the curve that repeats at the same openings and pressures.
     gain : PairedTest or None
@@ -121,17 +107,13 @@ class Validation:
 
 
 def validate(
-    characteristic: Characteristic,
-    other: OtherData,
-    tolerance_mw: float,
+    characteristic: Characteristic, other: OtherData, tolerance_mw: float,
     against: Characteristic | None = None,
-) -> Validation:
+) -> Validation:  # fmt: skip
     """Compare a characteristic with data that were not used to fit it.
 
     Parameters
     ----------
-    characteristic : Characteristic
-    other : OtherData
     tolerance_mw : float
         A mean difference below this is ignored.
     against : Characteristic, optional
@@ -146,6 +128,8 @@ def validate(
     trial = trial_of(data, characteristic)
     outside = _outside(trial, characteristic)
     predictions = _predictions(characteristic, data, trial)
+    by = SIMULATED if SIMULATED in predictions else CURVE
+    theirs: dict[str, FloatArray] = {}
     if against is not None:
         theirs_data = other.on_axis(against.static_form)
         theirs_trial = trial_of(theirs_data, against)
@@ -153,12 +137,9 @@ def validate(
         theirs = _predictions(against, theirs_data, theirs_trial)
         predictions |= {OTHER + name: values for name, values in theirs.items()}
     judgement = judge(trial, predictions)
-    by = SIMULATED if SIMULATED in predictions else CURVE
     checks = _checks(characteristic, trial, judgement, by)
-    gain = None
-    if against is not None:
-        theirs_by = OTHER + (SIMULATED if OTHER + SIMULATED in predictions else CURVE)
-        gain = judgement.gain(by, theirs_by)
+    theirs_by = OTHER + (SIMULATED if SIMULATED in theirs else CURVE)
+    gain = judgement.gain(by, theirs_by) if theirs else None
     found = Validation(
         characteristic, against, by, tolerance_mw, trial, predictions, judgement, outside,
         checks[0], checks[1:], _verdict(checks, tolerance_mw), gain,

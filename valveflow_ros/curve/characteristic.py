@@ -20,35 +20,17 @@ from valveflow_ros.signals.units import in_unit
 
 _COMMON_MPA = 10.0
 
-# The design of a chart is separate from the chart's kernels: readers of models need no kernels.
-
 
 @dataclass(frozen=True, slots=True)
 class ChartDesign:
-    """The design of a control chart for the residual.
+    """The design of a control chart for the residual."""
 
-    Attributes
-    ----------
-    block_s : float
-        Length of a block.
-    correlation : float
-        Lag-one correlation of block means, 0 <= correlation < 1.
-    innovation_mw : float
-        sd of a block mean given the previous one.
-    slack : tuple of float
-        Slack of each sum per block, in innovations: for small and for large shifts.
-    limit : tuple of float
-        Alarm limit of each sum, in innovations.
-    run_length_days : float
-        Mean time between false alarms for which the limits were chosen.
-    """
-
-    block_s: float
-    correlation: float
-    innovation_mw: float
-    slack: tuple[float, float]
-    limit: tuple[float, float]
-    run_length_days: float
+    block_s: float  # length of a block
+    correlation: float  # lag-one correlation of block means, 0 <= correlation < 1
+    innovation_mw: float  # sd of a block mean given the previous one
+    slack: tuple[float, float]  # per block, in innovations: of the sum for small and large shifts
+    limit: tuple[float, float]  # of each sum, in innovations
+    run_length_days: float  # mean time between false alarms for which the limits were chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,37 +126,19 @@ class FittedData:
 
 @dataclass(frozen=True, slots=True)
 class FormEvidence:
-    """Comparison of the form of the curve with the other form, on held-out stretches of time.
+    """Comparison of the form of the curve with the other form, on held-out stretches of time."""
 
-    Attributes
-    ----------
-    chosen : str
-        'integrated_input' or 'opening'.
-    told : bool
-        True if the data decide for the chosen form.
-    log_likelihood_gain : float
-        Gain of the chosen form.
-    rmse_mw, rmse_other_mw : float
-        Errors of means over a minute.
-    other : str
-        The other form with its best exponent.
-    apart_mw : float
-        Root mean square difference of the two forms over the visited range.
-    worst : tuple of float
-        Opening in %, pressure in MPa and difference in MW where 1 % of the means differ more.
-    contradicted : bool
-        True if the form was given, and the data show that it is wrong.
-    """
-
-    chosen: str
-    told: bool
-    log_likelihood_gain: float
-    rmse_mw: float
+    chosen: str  # 'integrated_input' or 'opening'
+    told: bool  # the data decide for the chosen form
+    log_likelihood_gain: float  # of the chosen form
+    rmse_mw: float  # of means over a minute
     rmse_other_mw: float
-    other: str = ''
+    other: str = ''  # the other form with its best exponent
+    # Root mean square difference of the two forms over the visited range; opening in %, pressure
+    # in MPa and difference where 1 % of the means differ more.
     apart_mw: float = math.nan
     worst: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    contradicted: bool = False
+    contradicted: bool = False  # the form was given, and the data show that it is wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,12 +179,7 @@ _WANDER_NS = 2 * 86_400 * NS_PER_S
 def level_error_mw(wander_mw: float, start_ns: int, end_ns: int) -> float:
     """Return the standard error of a mean over a period, due to the variation over days.
 
-    Parameters
-    ----------
-    wander_mw : float
-        sd from day to day; the error is 0 if it is NaN (unknown).
-    start_ns, end_ns : int
-        Start and end of the period.
+    ``wander_mw`` is the sd from day to day; the error is 0 if it is NaN (unknown).
     """
     share = _WANDER_NS / (_WANDER_NS + max(end_ns - start_ns, 0))
     return 0.0 if math.isnan(wander_mw) else wander_mw * math.sqrt(share)
@@ -424,11 +383,7 @@ class Characteristic:
             p^e F(V p^q) + c. NaN outside the identified range of u = V p^q, if the pressure
             is not positive, and if an argument is NaN.
         """
-        opening, pressure = np.broadcast_arrays(
-            np.asarray(opening_percent, dtype=np.float64),
-            np.asarray(pressure_mpa, dtype=np.float64),
-        )
-        positive = np.where(pressure > 0.0, pressure, np.nan)
+        opening, positive = _with_pressure(opening_percent, pressure_mpa)
         return self(opening * positive**self.pressure_exponent, positive)
 
     def opening(self, power_mw: ArrayLike, pressure_mpa: ArrayLike) -> FloatArray:
@@ -452,11 +407,8 @@ class Characteristic:
         --------
         inverse : the same in u, for curves that always rise; also defined within a jump.
         """
-        power, pressure = np.broadcast_arrays(
-            np.asarray(power_mw, dtype=np.float64), np.asarray(pressure_mpa, dtype=np.float64)
-        )
+        power, positive = _with_pressure(power_mw, pressure_mpa)
         m = self.model
-        positive = np.where(pressure > 0.0, pressure, np.nan)
         flow = (power - m.offset) / self.static_form.scale(positive)
         found = np.full(power.shape, np.nan)
         for k, slope in enumerate(m.slopes()):
@@ -498,6 +450,14 @@ class Characteristic:
         return replace(self, model_id=digest[:12])
 
 
+def _with_pressure(values: ArrayLike, pressure_mpa: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return both in one shape; a pressure that is not positive becomes NaN."""
+    given, pressure = np.broadcast_arrays(
+        np.asarray(values, dtype=np.float64), np.asarray(pressure_mpa, dtype=np.float64)
+    )
+    return given, np.where(pressure > 0.0, pressure, np.nan)
+
+
 def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
     """Return the points (x, u) of the line of the smallest u that reaches each power.
 
@@ -516,22 +476,10 @@ def _rising_points(m: RegionalModel) -> tuple[FloatArray, FloatArray]:
     return np.array([x for x, _ in points]), np.array([u for _, u in points])
 
 
-# The standard error of a curve at one u, from the standard errors of slope and intercept.
-
-
 def piece_error(piece: Piece, u: FloatArray) -> FloatArray:
     """Return the standard error of a piece's line at ``u`` in MW (MW / MPa^e where e > 0).
 
-    Parameters
-    ----------
-    piece : Piece
-    u : float64 (n,)
-        Integrated input, % MPa^m.
-
-    Returns
-    -------
-    float64 (n,)
-        NaN if the slope's error is unknown.
+    It is NaN if the slope's error is unknown.
 
     Notes
     -----

@@ -42,16 +42,11 @@ from valveflow_ros.errors import DataError
 from valveflow_ros.records import FLOW_UNITS
 from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, StaticForm
 
-# Causes that were kept fixed while a curve was fitted, as JSON.
-
 
 def held_json(held: tuple[HeldCause, ...]) -> dict[str, Any]:
     """Return the causes under their key; empty for a curve without causes."""
-    if not held:
-        return {}
-    return {
-        'held': [{'name': h.name, 'values': dict(h.values), 'sentence': h.sentence} for h in held]
-    }
+    found = [{'name': h.name, 'values': dict(h.values), 'sentence': h.sentence} for h in held]
+    return {'held': found} if held else {}
 
 
 # The name of a cause, and its values; the catalogue of causes defines which values it has.
@@ -84,78 +79,61 @@ _READABLE = (1, 2)
 _LEAST_EXPONENT = 0.5
 
 
-def _number(value: float) -> float | None:
-    """Replace NaN and infinity, which JSON does not have, by None."""
+def number(value: float) -> float | None:
+    """Return a number for JSON; None for NaN and infinity, which JSON does not have."""
     return float(value) if math.isfinite(value) else None
 
 
-def _piece_json(piece: Piece) -> dict[str, Any]:
-    return {
-        'u_from': piece.u_from,
-        'u_to': piece.u_to,
-        'slope': piece.slope,
-        'intercept': piece.intercept,
-        'slope_stderr': _number(piece.slope_stderr),
-        'intercept_stderr': _number(piece.intercept_stderr),
-        'samples': piece.samples,
-    }
+def _plain(record: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass; numbers that JSON does not have are None."""
+    return {k: number(v) if isinstance(v, float) else v for k, v in asdict(record).items()}
 
 
 def _supported_json(c: Characteristic) -> list[dict[str, Any]]:
     """Return the pieces, each with its data if these are known."""
-    pieces = [_piece_json(p) for p in c.pieces]
+    pieces = [_plain(p) for p in c.pieces]
     for piece, support in zip(pieces, c.support, strict=False):
-        piece['identifiable'] = support.identifiable
-        piece['support'] = {
-            'steady': support.steady,
-            'slope_response': support.slope_response,
-            'samples': support.samples,
-            'levels': list(support.levels),
-        }
+        data = {**asdict(support), 'levels': list(support.levels)}
+        piece['identifiable'] = data.pop('identifiable')
+        piece['support'] = data
     return pieces
 
 
-def _chart_json(chart: ChartDesign | None) -> dict[str, Any]:
-    """Return the chart under its key; empty for a curve without a chart."""
-    if chart is None:
-        return {}
+def _chart_json(chart: ChartDesign) -> dict[str, Any]:
     small, large = (
         {'slack': k, 'limit': h} for k, h in zip(chart.slack, chart.limit, strict=True)
     )
     return {
-        'chart': {
-            'block_s': chart.block_s,
-            'correlation': chart.correlation,
-            'innovation_mw': chart.innovation_mw,
-            'small': small,
-            'large': large,
-            'run_length_days': chart.run_length_days,
-        }
-    }
+        'block_s': chart.block_s, 'correlation': chart.correlation,
+        'innovation_mw': chart.innovation_mw, 'small': small, 'large': large,
+        'run_length_days': chart.run_length_days,
+    }  # fmt: skip
 
 
-def _form_json(form: FormEvidence | None) -> dict[str, Any]:
-    """Return the evidence under its key; empty for a curve without evidence."""
-    if form is None:
+def _residuals_json(found: ResidualStatistics) -> dict[str, Any]:
+    """Return the statistics; empty if they are unknown."""
+    if not math.isfinite(found.rmse_mw):
         return {}
-    return {
-        'form': {
-            'chosen': form.chosen,
-            'told': form.told,
-            'log_likelihood_gain': form.log_likelihood_gain,
-            'rmse_mw': _number(form.rmse_mw),
-            'rmse_other_mw': form.rmse_other_mw,
-            'other': form.other,
-            'apart_mw': _number(form.apart_mw),
-            'worst': dict(zip(_WORST, map(_number, form.worst), strict=True)),
-            'contradicted': form.contradicted,
-        }
-    }
+    told = _plain(found)
+    wander_mw = told.pop('wander_mw')
+    del told['chart']
+    # No key if a value is unknown, so that the hash of older curves is unchanged.
+    if wander_mw is not None:
+        told['wander_mw'] = wander_mw
+    return told if found.chart is None else {**told, 'chart': _chart_json(found.chart)}
 
 
 def to_json(c: Characteristic) -> dict[str, Any]:
     """Return the content of ``characteristic.json``."""
-    wander_mw = c.residuals.wander_mw
+    choice, source = c.choice, c.source
+    form = {}
+    if c.form is not None:
+        worst = dict(zip(_WORST, map(number, c.form.worst), strict=True))
+        form = {'form': {**_plain(c.form), 'worst': worst}}
+    cost, angle, confidence = (
+        {str(j): number(v) for j, v in by_pieces.items()}
+        for by_pieces in (choice.cost, choice.turning_angle, choice.confidence)
+    )
     return {
         'format': FORMAT,
         'version': VERSION,
@@ -165,59 +143,31 @@ def to_json(c: Characteristic) -> dict[str, Any]:
         'pressure_exponent': c.pressure_exponent,
         'pressure_scale_exponent': c.pressure_scale_exponent,
         'offset_mw': c.offset_mw,
-        'reference_pressure_mpa': _number(c.reference_pressure_mpa),
-        **_form_json(c.form),
+        'reference_pressure_mpa': number(c.reference_pressure_mpa),
+        **form,
         **({'openings_seen': [asdict(s) for s in c.openings_seen]} if c.openings_seen else {}),
         'pieces': _supported_json(c),
-        'breakpoint_intervals': [[_number(lo), _number(hi)] for lo, hi in c.breakpoint_intervals],
+        'breakpoint_intervals': [[number(lo), number(hi)] for lo, hi in c.breakpoint_intervals],
         'selection': {
-            'rule': c.choice.rule,
-            'cost': {str(j): _number(v) for j, v in c.choice.cost.items()},
-            'turning_angle': {str(j): _number(v) for j, v in c.choice.turning_angle.items()},
-            'note': c.choice.note,
-            'confidence': {str(j): _number(v) for j, v in c.choice.confidence.items()},
+            'rule': choice.rule, 'cost': cost, 'turning_angle': angle, 'note': choice.note,
+            'confidence': confidence,
         },
         'segments': {
-            'steady': c.source.steady,
-            'slope_response': c.source.slope_response,
-            'samples': c.source.samples,
+            name: getattr(source, name) for name in ('steady', 'slope_response', 'samples')
         },
-        'window': {'start_ns': c.source.window_start_ns, 'end_ns': c.source.window_end_ns},
+        'window': {'start_ns': source.window_start_ns, 'end_ns': source.window_end_ns},
         'temperature': {
-            'mean_degc': _number(c.source.temperature_mean_degc),
-            'spread_k': _number(c.source.temperature_spread_k),
-            'flag': c.source.temperature_flag,
+            'mean_degc': number(source.temperature_mean_degc),
+            'spread_k': number(source.temperature_spread_k),
+            'flag': source.temperature_flag,
         },
-        'dynamics': [
-            {
-                'power_from': d.power_from,
-                'power_to': d.power_to,
-                'time_constant_s': d.time_constant_s,
-                'delay_s': d.delay_s,
-                'time_constant_stderr_s': _number(d.time_constant_stderr_s),
-                'delay_stderr_s': _number(d.delay_stderr_s),
-                'power_to_stderr_mw': _number(d.power_to_stderr_mw),
-            }
-            for d in c.dynamics
-        ],
-        'residuals': {
-            'rmse_mw': c.residuals.rmse_mw,
-            'average_sd_mw': c.residuals.average_sd_mw,
-            'average_s': c.residuals.average_s,
-            'input_noise': c.residuals.input_noise,
-            'power_noise_mw': c.residuals.power_noise_mw,
-            'width_mw': _number(c.residuals.width_mw),
-            # No key if the value is unknown, so that the hash of older curves is unchanged.
-            **({'wander_mw': wander_mw} if math.isfinite(wander_mw) else {}),
-            **_chart_json(c.residuals.chart),
-        }
-        if math.isfinite(c.residuals.rmse_mw)
-        else {},
-        'partition': {'pieces': [_piece_json(p) for p in c.partition_pieces]},
+        'dynamics': [_plain(d) for d in c.dynamics],
+        'residuals': _residuals_json(c.residuals),
+        'partition': {'pieces': [_plain(p) for p in c.partition_pieces]},
         'notes': list(c.notes),
         **held_json(c.held),
         'optimal': bool(c.partition_pieces),
-    }
+    }  # fmt: skip
 
 
 # A very uncertain error may be arbitrarily large.
@@ -317,7 +267,7 @@ def from_json(raw: object) -> Characteristic:
         raise DataError(f"This is no flow characteristic: 'format' must be '{FORMAT}'.")
     if not any(raw.get('version') is readable for readable in _READABLE):
         raise DataError(
-            f'The characteristic has version {_told(raw.get("version"))}, this program reads '
+            f'The characteristic has version {raw.get("version")!r:.20}, this program reads '
             f'{" and ".join(map(str, _READABLE))}.'
         )
     top = checked(raw, _SCHEMA, _WHOLE)
@@ -395,17 +345,12 @@ def _form(found: dict[str, Any] | None) -> FormEvidence | None:
     if found is None:
         return None
     nan = math.nan
-    return FormEvidence(
-        found['chosen'], bool(found['told']), found['log_likelihood_gain'],
-        nan if found['rmse_mw'] is None else found['rmse_mw'], found['rmse_other_mw'],
-        found['other'] or '', nan if found['apart_mw'] is None else found['apart_mw'],
-        (nan, nan, nan) if found['worst'] is None else tuple(found['worst'].values()),
-        bool(found['contradicted']),
-    )  # fmt: skip
-
-
-def _told(version: object) -> str:
-    return repr(version)[:20]
+    unknown = {
+        'told': False, 'rmse_mw': nan, 'other': '', 'apart_mw': nan,
+        'worst': dict.fromkeys(_WORST, nan), 'contradicted': False,
+    }  # fmt: skip
+    known = {**unknown, **{k: v for k, v in found.items() if v is not None}}
+    return FormEvidence(**{**known, 'worst': tuple(known['worst'].values())})
 
 
 def _piece(found: dict[str, Any]) -> Piece:
@@ -471,26 +416,24 @@ def check_pieces(pieces: list[dict[str, Any]], whole: str, path: str, joint: Joi
                 raise fail(whole, f'{path}[{k}]', f'leads to {power:g} MW at {end}')
 
 
-def _fail(path: str, problem: str) -> DataError:
-    return fail(_WHOLE, path, problem)
-
-
 def _check_intervals(top: dict[str, Any]) -> None:
     pieces, intervals = top['pieces'], top['breakpoint_intervals']
     if len(intervals) != len(pieces) - 1:
-        raise _fail('breakpoint_intervals', "must have one entry less than 'pieces'")
+        raise fail(_WHOLE, 'breakpoint_intervals', "must have one entry less than 'pieces'")
     for k, (low, high) in enumerate(intervals):
         # Comparisons with NaN (unknown) are false.
         if low > pieces[k]['u_to'] or high < pieces[k]['u_to']:
-            raise _fail(f'breakpoint_intervals[{k}]', 'does not hold its breakpoint')
+            raise fail(_WHOLE, f'breakpoint_intervals[{k}]', 'does not hold its breakpoint')
 
 
 def _check_order(top: dict[str, Any]) -> None:
     window, dynamics = top['window'], top['dynamics']
     if window and window['end_ns'] < window['start_ns']:
-        raise _fail('window.end_ns', 'is before start_ns')
+        raise fail(_WHOLE, 'window.end_ns', 'is before start_ns')
     for k, region in enumerate(dynamics):
         if not region['power_from'] < region['power_to']:
-            raise _fail(f'dynamics[{k}].power_to', 'is not above power_from')
+            raise fail(_WHOLE, f'dynamics[{k}].power_to', 'is not above power_from')
         if k and region['power_from'] != dynamics[k - 1]['power_to']:
-            raise _fail(f'dynamics[{k}].power_from', 'is not where the region before it ends')
+            raise fail(
+                _WHOLE, f'dynamics[{k}].power_from', 'is not where the region before it ends'
+            )

@@ -20,8 +20,6 @@ from valveflow_ros.curve.characteristic import (
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.records import FloatArray
 
-# Choice of the points of a rising broken line that a short table keeps.
-
 
 def spread(x: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Add points to a broken line until it has ``count``; all corners are kept.
@@ -40,9 +38,7 @@ def spread(x: FloatArray, y: FloatArray, count: int) -> tuple[FloatArray, FloatA
         if width[k] <= 0.0:
             break
         parts[k] += 1
-    at = [
-        np.linspace(x[k], x[k + 1], parts[k], endpoint=False) for k in range(len(width))
-    ]  # fmt: skip
+    at = [np.linspace(x[k], x[k + 1], parts[k], endpoint=False) for k in range(len(width))]
     new_x = np.concatenate([*at, x[-1:]])
     share = [np.arange(n) / n for n in parts.tolist()]
     new_y = np.concatenate(
@@ -100,67 +96,34 @@ _STEEP = 5.0  # default gain limit, as a multiple of the smallest gain
 
 @dataclass(frozen=True, slots=True)
 class Compensation:
-    """The table from demanded power to integrated input.
+    """The table from demanded power to integrated input, of n points."""
 
-    Attributes
-    ----------
-    power_mw, u, u_stderr : float64 (n,)
-        The table: power is increasing, u is not decreasing; one standard error of u.
-    gain : float64 (n,)
-        Units of u per MW from this point to the next; the last value repeats the previous one.
-    within : bool (n,)
-        True if the gain is within its limit.
-    curve : Characteristic
-        The part of the curve that was inverted.
-    gains : float64 (J,)
-        Units of u per MW of each of its pieces.
-    gain_limit : float
-    largest_step : float
-        The largest ratio of the gains of two neighbouring pieces, 1 or more.
-    useful_mw : tuple of float
-        The widest range of power over which the gain stays within its limit.
-    identity_mw : float
-        Largest ``|F(F^-1(x)) - x|`` over the whole range, without jumps.
-    table_mw, table_u : float
-        Largest error of interpolation in the rounded table, in MW and in u.
-    jumps : tuple of (float, float, float)
-        Jumps of the curve: u, and the powers below and above.
-    first_piece : int
-        Number of the first of these pieces in the whole curve, from 1.
-    notes : tuple of str
-    """
-
-    power_mw: FloatArray
-    u: FloatArray
-    u_stderr: FloatArray
-    gain: FloatArray
-    within: np.ndarray
-    curve: Characteristic
-    gains: FloatArray
+    power_mw: FloatArray  # (n,), increasing
+    u: FloatArray  # (n,), not decreasing
+    u_stderr: FloatArray  # (n,)
+    gain: FloatArray  # (n,) units of u per MW to the next point; the last one is repeated
+    within: np.ndarray  # bool (n,): the gain is within its limit
+    curve: Characteristic  # the part of the curve that was inverted
+    gains: FloatArray  # (J,) units of u per MW of each of its pieces
     gain_limit: float
-    largest_step: float
-    useful_mw: tuple[float, float]
-    identity_mw: float
-    table_mw: float
+    largest_step: float  # largest ratio of the gains of two neighbouring pieces, 1 or more
+    useful_mw: tuple[float, float]  # widest range over which the gain stays within its limit
+    identity_mw: float  # largest `|F(F^-1(x)) - x|` over the whole range, without jumps
+    table_mw: float  # largest error of interpolation in the rounded table, in MW and in u
     table_u: float
-    jumps: tuple[tuple[float, float, float], ...]
-    first_piece: int
+    jumps: tuple[tuple[float, float, float], ...]  # u, and the powers below and above
+    first_piece: int  # number of the first of these pieces in the whole curve, from 1
     notes: tuple[str, ...]
 
 
 def compensate(
-    curve: Characteristic,
-    points: int = 16,
-    gain_limit: float | None = None,
-    u_from: float = -math.inf,
-    u_to: float = math.inf,
-    places: int = 4,
-) -> Compensation:
+    curve: Characteristic, points: int = 16, gain_limit: float | None = None,
+    u_from: float = -math.inf, u_to: float = math.inf, places: int = 4,
+) -> Compensation:  # fmt: skip
     """Invert a curve.
 
     Parameters
     ----------
-    curve : Characteristic
     points : int
         Length of the table, 2 or more. With J + 1 or more points the table contains all knots
         and linear interpolation is exact; with fewer, those knots are kept that minimise
@@ -251,7 +214,6 @@ def _rises(curve: Characteristic, first: int) -> None:
 
 
 def _jumps(curve: Characteristic) -> tuple[tuple[float, float, float], ...]:
-    """Return where the curve jumps up."""
     ends = [
         (a.u_to, _end(a, a.u_to), _end(b, b.u_from)) for a, b in itertools.pairwise(curve.pieces)
     ]
@@ -307,9 +269,7 @@ def _table_errors(curve: Characteristic, x: FloatArray, u: FloatArray) -> tuple[
         at_table[(x >= low - 1e-3) & (x <= high + 1e-3)] = 0.0
     off_mw = np.abs(power_at - corners_x)[~jumping]
     off_u = np.abs(np.interp(corners_x, x, u) - corners_u)
-    return (
-        float(max(off_mw.max(initial=0.0), at_table.max(initial=0.0))), float(off_u.max()),
-    )  # fmt: skip
+    return float(max(off_mw.max(initial=0.0), at_table.max(initial=0.0))), float(off_u.max())
 
 
 def _u_error(curve: Characteristic, u: FloatArray) -> FloatArray:
@@ -346,7 +306,6 @@ def _useful(curve: Characteristic, gains: FloatArray, limit: float) -> tuple[flo
 
 
 def _notes(made: Compensation, points: int, exact: int) -> tuple[str, ...]:
-    """Return the notes for the user of the table."""
     notes = [
         f'Below {made.power_mw[0]:.2f} MW and above {made.power_mw[-1]:.2f} MW nothing is known '
         'of the valve: the controller must hold u at the end of the table there.'

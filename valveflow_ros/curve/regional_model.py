@@ -100,9 +100,7 @@ class RegionalModel:
         scale: FloatArray | float = 1.0,
     ) -> tuple[FloatArray, ByteArray]:  # fmt: skip
         """Return the dynamic prediction in MW and a mask of settled rows, shapes (n,)."""
-        answer = np.empty(len(u))
-        settled = np.empty(len(u), dtype=np.uint8)
-
+        answer, settled = np.empty(len(u)), np.empty(len(u), dtype=np.uint8)
         respond(
             self.static(u, scale), usable, self.levels, self.taps(step_s),
             round(settle_s / step_s), answer, settled,
@@ -220,18 +218,12 @@ def lag_step(flow: FloatArray, at: int, age: int, tap: FloatArray, state: float)
 
 @jit
 def respond(
-    x: FloatArray,
-    usable: ByteArray,
-    levels: FloatArray,
-    taps: FloatArray,
-    settle: int,
-    answer: FloatArray,
-    settled: ByteArray,
-) -> None:
+    x: FloatArray, usable: ByteArray, levels: FloatArray, taps: FloatArray, settle: int,
+    answer: FloatArray, settled: ByteArray,
+) -> None:  # fmt: skip
     """Filter the flow ``x`` (n,) into the power ``answer`` (n,).
 
-    After a gap the filter starts in steady state, and
-    ``settled`` is 0 for ``settle`` rows.
+    After a gap the filter starts in steady state, and ``settled`` is 0 for ``settle`` rows.
     """
     state = 0.0
     age = 0

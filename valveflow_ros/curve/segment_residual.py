@@ -13,16 +13,8 @@ import numpy as np
 from scipy.special import fdtrc, ndtri, stdtr
 
 from valveflow_ros.curve.characteristic import Characteristic, piece_of
-from valveflow_ros.records import (
-    NS_PER_S,
-    FloatArray,
-    IntArray,
-    SegmentKind,
-    SpecialSegment,
-)
+from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SegmentKind, SpecialSegment
 from valveflow_ros.signals.static_form import StaticForm
-
-# The time at which a series changed its mean, and the p-value of the change.
 
 LEAST_SIDE = 4  # minimum members on each side of a change
 _LARGEST_RHO = 0.9
@@ -30,40 +22,21 @@ _LEAST_VARIANCE = 1e-200  # keeps z^2 finite without noise
 _FAR = 38.0  # normal deviate beyond which the density underflows
 
 
-@dataclass(frozen=True, slots=True)
-class Scan:
-    """One change of the mean, tested at every position.
+class Scan(NamedTuple):
+    """One change of the mean, tested at every position; values in the unit of the series."""
 
-    Attributes
-    ----------
-    place : int
-        Members before the change.
-    p_value : float
-        Probability of such a change at any position if there is none.
-    before, after : float
-        Weighted means on both sides, in the unit of the series.
-    after_error : float
-        Standard error of ``after``.
-    """
-
-    place: int
-    p_value: float
-    before: float
+    place: int  # members before the change
+    p_value: float  # of such a change at any position if there is none
+    before: float  # weighted means on both sides
     after: float
-    after_error: float
+    after_error: float  # standard error of `after`
 
 
 def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None:
     """Test for one change of the mean; return None if the series is too short.
 
-    Parameters
-    ----------
-    values : float64 (n,)
-        In chronological order.
-    weights : float64 (n,)
-        Inverse variances up to a factor.
-    first : int
-        Changes with fewer members before them are not tested.
+    The values (n,) are in chronological order, the weights (n,) inverse variances up to a factor.
+    Changes with fewer than ``first`` members before them are not tested.
 
     Notes
     -----
@@ -87,7 +60,7 @@ def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None
     k = int(np.argmax(gain))
     place = int(places[k])
     rest = values - np.where(np.arange(n) < place, before[k], after[k])
-    variance = _variance(rest, weights) * _widening(rest)
+    variance = _variance(rest, weights, max(n - 2, 1)) * _widening(rest)
     z = np.sqrt(gain / variance)
     b = _as_normal(float(z[k]), n - 2)
     return Scan(
@@ -96,9 +69,9 @@ def scan(values: FloatArray, weights: FloatArray, first: int = 0) -> Scan | None
     )  # fmt: skip
 
 
-def _variance(rest: FloatArray, weights: FloatArray) -> float:
+def _variance(rest: FloatArray, weights: FloatArray, freedom: int) -> float:
     """Return the variance of a member with weight 1."""
-    return max(float(np.sum(weights * rest**2)) / max(len(rest) - 2, 1), _LEAST_VARIANCE)
+    return max(float(np.sum(weights * rest**2)) / freedom, _LEAST_VARIANCE)
 
 
 def _widening(rest: FloatArray) -> float:
@@ -137,22 +110,11 @@ _POINTS = 64  # points along a ramp, for the mean of a curve with breakpoints
 
 @dataclass(frozen=True, slots=True)
 class SegmentResiduals:
-    """Residuals of segments about one curve, sorted by time; all arrays have shape (n,).
+    """Residuals of segments about one curve, sorted by time; all arrays have shape (n,)."""
 
-    Attributes
-    ----------
-    time_ns : int64
-        Middle of the segment.
-    u : float64
-        Middle of the segment, % MPa^m.
-    residual_mw : float64
-        Mean power minus the power of the curve.
-    samples : int64
-    """
-
-    time_ns: IntArray
-    u: FloatArray
-    residual_mw: FloatArray
+    time_ns: IntArray  # middle of the segment
+    u: FloatArray  # middle of the segment, % MPa^m
+    residual_mw: FloatArray  # mean power minus the power of the curve
     samples: IntArray
 
     def __len__(self) -> int:
@@ -194,16 +156,15 @@ def segment_residuals(
     """
     known = bool(curve.dynamics)
     knots = curve.breakpoints
-    placed = [(s, _ends(curve.static_form, s)) for s in segments]
+    placed = [(s, *_ends(curve.static_form, s)) for s in segments]
     placed = [
-        (s, ends) for s, ends in placed
-        if ends.u.min() >= knots[0] and ends.u.max() <= knots[-1]
+        (s, u, scale) for s, u, scale in placed
+        if u.min() >= knots[0] and u.max() <= knots[-1]
         and (known or s.kind == SegmentKind.STEADY)
     ]  # fmt: skip
     placed.sort(key=lambda each: each[0].end_ns)
-    kept = [s for s, _ in placed]
-    u = np.array([ends.u for _, ends in placed]).reshape(-1, 2)
-    scale = np.array([ends.scale for _, ends in placed]).reshape(-1, 2)
+    kept = [s for s, _, _ in placed]
+    u, scale = (np.array([each[k] for each in placed]).reshape(-1, 2) for k in (1, 2))
     middle = u.mean(axis=1)
     measured = np.array([0.5 * (s.power_start_mw + s.power_end_mw) for s in kept])
     return SegmentResiduals(
@@ -214,23 +175,15 @@ def segment_residuals(
     )
 
 
-class _Ends(NamedTuple):
-    """The argument and the factor of a curve at both ends of a segment."""
-
-    u: FloatArray
-    scale: FloatArray
-
-
-def _ends(form: StaticForm, segment: SpecialSegment) -> _Ends:
-    """Return the ends of a segment on the axis of a curve; NaN if they are unknown."""
-    s = segment
+def _ends(form: StaticForm, s: SpecialSegment) -> tuple[FloatArray, FloatArray]:
+    """Return argument and factor of a curve at both ends of a segment; NaN if unknown."""
     if not form.scaled and (math.isnan(s.exponent) or s.exponent == form.exponent):
-        return _Ends(np.array([s.u_start, s.u_end]), np.ones(2))
+        return np.array([s.u_start, s.u_end]), np.ones(2)
     u, scale = form.of_rows(
         np.array([s.opening_start_percent, s.opening_end_percent]),
         np.array([s.pressure_start_mpa, s.pressure_end_mpa]),
     )
-    return _Ends(u, np.ones(2) if scale is None else scale)
+    return u, np.ones(2) if scale is None else scale
 
 
 def _expected(
@@ -262,12 +215,8 @@ def _expected(
 def after_known_changes(series: SegmentResiduals, known_ns: int) -> SegmentResiduals:
     """Return the segments after the most significant change before a time.
 
-    Parameters
-    ----------
-    series : SegmentResiduals
-    known_ns : int
-        End of the reference's data: a change before it is contained in the reference, and is no
-        shift relative to it.
+    A change before the end of the reference's data, ``known_ns``, is contained in the reference,
+    and is no shift relative to it.
     """
     known = series.part(np.arange(series.count_until(known_ns)))
     found = scan(known.residual_mw, known.weights)
@@ -284,20 +233,9 @@ def common_change(
     Each piece has a level before and a level after the time; one member on a side is enough, for
     the members of all pieces determine the time together.
 
-    Parameters
-    ----------
-    series : sequence of SegmentResiduals
-        One per piece.
-    known_ns : int
-        Earlier changes are not considered.
-    share : float
-        Probability of the interval.
-
-    Returns
-    -------
-    tuple of int
-        Median, lower and upper end of the distribution of the time, ns. The prior is uniform
-        in time. 0, 0, 0 if no common change is seen.
+    Changes before ``known_ns`` are not considered; ``share`` is the probability of the interval.
+    Return median, lower and upper end of the distribution of the time, ns, for a prior that is
+    uniform in time; 0, 0, 0 if no common change is seen.
     """
     edges = np.unique(np.concatenate([s.time_ns for s in series]))
     allowed = edges[1:] > known_ns
@@ -325,7 +263,7 @@ def common_change(
     rest = np.concatenate([_about_levels(s, split_ns) for s in series])
     weights = np.concatenate([s.weights for s in series])
     order = np.argsort(np.concatenate([s.time_ns for s in series]), kind='stable')
-    variance = max(float(np.sum(weights * rest**2)) / freedom, _LEAST_VARIANCE)
+    variance = _variance(rest, weights, freedom)
     likelihood = np.where(allowed, 0.5 * gain / (variance * _widening(rest[order])), -math.inf)
     # The tail of F with one level per piece, as the normal deviate of one level.
     levels = max(int(sided[best]), 1)

@@ -12,12 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from valveflow_ros.curve.characteristic import (
-    Characteristic,
-    Piece,
-    curve_error,
-    level_error_mw,
-)
+from valveflow_ros.curve.characteristic import Characteristic, Piece, curve_error, level_error_mw
+from valveflow_ros.curve.characteristic_json import number
 from valveflow_ros.curve.segment_residual import (
     LEAST_SIDE,
     Scan,
@@ -30,32 +26,22 @@ from valveflow_ros.curve.segment_residual import (
 from valveflow_ros.errors import DataError, short
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
 
-# The result of the test as a sentence for the operator.
-
 _SURE = 0.9999
 
 
 def shift_sentence(shift: Shift, reference: Characteristic) -> str:
     """Return a sentence on the piece that shifted, the size, onset and confidence; or on no shift.
 
-    Parameters
-    ----------
-    shift : Shift
-    reference : Characteristic
-        Possibly only a part of it was compared.
+    A second one names the compared range if it is not the whole reference.
     """
-    return _judgement(shift, reference) + _compared(shift, reference)
-
-
-def _compared(shift: Shift, reference: Characteristic) -> str:
-    """Return a sentence on the compared range if it is not the whole reference."""
+    judgement = _judgement(shift, reference)
     first, last = float(reference.breakpoints[0]), float(reference.breakpoints[-1])
     known = [p for p in shift.pieces if math.isfinite(p.u_from)]
     low, high = min(p.u_from for p in known), max(p.u_to for p in known)
     if low <= first and high >= last:
-        return ''
+        return judgement
     return (
-        f' Only the range {reference.place_words(low, high)} could be compared; the '
+        f'{judgement} Only the range {reference.place_words(low, high)} could be compared; the '
         f'reference covers {reference.place_words(first, last)}.'
     )
 
@@ -69,18 +55,17 @@ def _judgement(shift: Shift, curve: Characteristic) -> str:
         smallest = [p.smallest_mw for p in known if math.isfinite(p.smallest_mw)]
         if not smallest:
             return f'No shift against {reference} is seen, but no error of the curves is known.'
-        low, high = min(smallest), max(smallest)
-        least, most = short(low, 1), short(high, 1)
+        least, most = short(min(smallest), 1), short(max(smallest), 1)
         span = least if least == most else f'{least} to {most}'
         return (
             f'The curve agrees with {reference}; a shift of {span} MW, by piece, '
             'would have been seen.'
         )
-    number = shift.pieces.index(worst) + 1
+    index = shift.pieces.index(worst) + 1
     side = 'more' if worst.shift_mw > 0.0 else 'less'
-    others = [k + 1 for k, p in enumerate(shift.pieces) if p.moved and k + 1 != number]
+    others = [k + 1 for k, p in enumerate(shift.pieces) if p.moved and k + 1 != index]
     return (
-        f'At {curve.place_words(worst.u_from, worst.u_to)} (piece {number}) the unit gives '
+        f'At {curve.place_words(worst.u_from, worst.u_to)} (piece {index}) the unit gives '
         f'{short(abs(worst.shift_mw), 1)} MW ({abs(worst.percent):.1f} %) {side} than '
         f'{reference}, {_since_words(shift)}. Confidence: {_confidence(worst)}.'
         f'{_others(shift, others, curve)}'
@@ -135,41 +120,22 @@ _TESTS = 2  # each piece is tested by the curves and by its segments
 
 @dataclass(frozen=True, slots=True)
 class PieceShift:
-    """Comparison of a piece of the current curve with the reference.
+    """Comparison of a piece of the current curve with the reference; NaN where unknown."""
 
-    Attributes
-    ----------
-    u_from, u_to : float
-        The part of the piece in the range of both curves; NaN if there is none.
-    middle_mw, low_mw, high_mw : float
-        Current minus reference: in the middle, and the extremes along the piece.
-    error_mw : float
-        Standard error of ``middle_mw``.
-    now_mw, now_error_mw : float
-        Mean difference of the segments after the change with its error, or of all segments of the
-        curve if the time is unknown; NaN if the piece has not shifted, or has no segments.
-    flow_mw : float
-        Power of the reference in the middle.
-    p_value : float
-        Probability of such a difference without a shift, corrected for all pieces and tests.
-    moved : bool
-        True if the p-value is below the limit, and the shift is at least the minimum size.
-    smallest_mw : float
-        The smallest shift that would have been detected.
-    """
-
-    u_from: float
+    u_from: float  # the part of the piece in the range of both curves
     u_to: float
-    middle_mw: float
+    middle_mw: float  # current minus reference: in the middle, and the extremes along the piece
     low_mw: float
     high_mw: float
-    error_mw: float
+    error_mw: float  # standard error of `middle_mw`
+    # Mean difference of the segments after the change with its error, or of all segments of the
+    # curve if the time is unknown; NaN if the piece has not shifted, or has no segments.
     now_mw: float
     now_error_mw: float
-    flow_mw: float
-    p_value: float
-    moved: bool
-    smallest_mw: float
+    flow_mw: float  # power of the reference in the middle
+    p_value: float  # of such a difference without a shift, corrected for all pieces and tests
+    moved: bool  # the p-value is below the limit, and the shift at least the minimum size
+    smallest_mw: float  # the smallest shift that would have been detected
 
     @property
     def shift_mw(self) -> float:
@@ -189,33 +155,19 @@ class PieceShift:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """The result of the test.
-
-    Attributes
-    ----------
-    reference_id, model_id : str
-    reference_ns : int
-        End of the reference's data.
-    first_ns : int
-        Time of the oldest segment used; 0 without any.
-    pieces : tuple of PieceShift
-        One per piece of the current curve.
-    since_ns, since_low_ns, since_high_ns : int
-        Onset of the shift, with a 95 % interval; 0 if the segments do not determine it, for
-        example if it was before the first of them.
-    sentence : str
-        The result for the operator.
-    """
+    """The result of the test."""
 
     reference_id: str
     model_id: str
-    reference_ns: int
-    first_ns: int
-    pieces: tuple[PieceShift, ...]
+    reference_ns: int  # end of the reference's data
+    first_ns: int  # time of the oldest segment used; 0 without any
+    pieces: tuple[PieceShift, ...]  # one per piece of the current curve
+    # Onset of the shift, with a 95 % interval; 0 if the segments do not determine it, for example
+    # if it was before the first of them.
     since_ns: int
     since_low_ns: int
     since_high_ns: int
-    sentence: str
+    sentence: str  # the result for the operator
 
     @property
     def moved(self) -> bool:
@@ -231,18 +183,10 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class ShiftLimits:
-    """The limits of the test.
+    """The limits of the test."""
 
-    Attributes
-    ----------
-    confidence : float
-        Required confidence, 0.5 to 1, for all pieces together.
-    least_mw : float
-        Smaller shifts are ignored.
-    """
-
-    confidence: float = 0.999
-    least_mw: float = 0.3
+    confidence: float = 0.999  # required, 0.5 to 1, for all pieces together
+    least_mw: float = 0.3  # smaller shifts are ignored
 
 
 def judge_shift(
@@ -312,14 +256,7 @@ def judge_shift(
 
 
 def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) -> str:
-    """Return a sentence if the unit changed within the data of a curve; otherwise an empty text.
-
-    Parameters
-    ----------
-    curve : Characteristic
-    segments : sequence of SpecialSegment
-        Those to which the curve was fitted.
-    """
+    """Return a sentence if the unit changed within the data of a curve, of these segments."""
     found = segment_residuals(curve, segments)
     change = scan(found.residual_mw, found.weights)
     if change is None or change.p_value > _MIXED_CHANCE:
@@ -366,7 +303,6 @@ def _comparable(reference: Characteristic, current: Characteristic) -> None:
 
 
 def _common(reference: Characteristic, piece: Piece) -> tuple[float, float] | None:
-    """Return the part of a piece of the current curve in the range of the reference."""
     knots = reference.breakpoints
     low = max(float(knots[0]), piece.u_from)
     high = min(float(knots[-1]), piece.u_to)
@@ -374,19 +310,13 @@ def _common(reference: Characteristic, piece: Piece) -> tuple[float, float] | No
 
 
 def _judged(
-    reference: Characteristic,
-    current: Characteristic,
-    index: int,
-    time_ns: IntArray,
-    found: Scan | None,
-    tests: int,
-    limits: ShiftLimits,
-) -> PieceShift:
+    reference: Characteristic, current: Characteristic, index: int, time_ns: IntArray,
+    found: Scan | None, tests: int, limits: ShiftLimits,
+) -> PieceShift:  # fmt: skip
     """Test one piece by the curves and by its segments, whose times are ``time_ns``."""
     common = _common(reference, current.pieces[index])
     if common is None:
-        nan = math.nan
-        return PieceShift(nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, False, nan)
+        return PieceShift(*[math.nan] * 10, False, math.nan)
     u = np.linspace(*common, _PROFILE)
     # The end points are left out: after a jump they have the neighbour's value.
     difference = (current.model.static(u) - reference.model.static(u))[1:-1]
@@ -473,34 +403,25 @@ def _two_sided(value: float, error: float) -> float:
     return float(2.0 * ndtr(-abs(value) / error))
 
 
-# The result of the test as JSON: the content of ``shift.json``.
-
 FORMAT = 'valveflow/shift'
 VERSION = 1
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+# Keys of a piece in ``shift.json`` that differ from the names here.
+_KEYS = {
+    'shift_percent': 'percent', 'middle_stderr_mw': 'error_mw', 'now_stderr_mw': 'now_error_mw',
+    'smallest_seen_mw': 'smallest_mw',
+}  # fmt: skip
+_PIECE = (
+    'u_from', 'u_to', 'moved', 'shift_mw', 'shift_percent', 'confidence', 'p_value', 'middle_mw',
+    'middle_stderr_mw', 'low_mw', 'high_mw', 'now_mw', 'now_stderr_mw', 'flow_mw',
+    'smallest_seen_mw',
+)  # fmt: skip
 
 
 def _piece_json(piece: PieceShift) -> dict[str, Any]:
-    return {
-        'u_from': _number(piece.u_from),
-        'u_to': _number(piece.u_to),
-        'moved': piece.moved,
-        'shift_mw': _number(piece.shift_mw),
-        'shift_percent': _number(piece.percent),
-        'confidence': _number(piece.confidence),
-        'p_value': _number(piece.p_value),
-        'middle_mw': _number(piece.middle_mw),
-        'middle_stderr_mw': _number(piece.error_mw),
-        'low_mw': _number(piece.low_mw),
-        'high_mw': _number(piece.high_mw),
-        'now_mw': _number(piece.now_mw),
-        'now_stderr_mw': _number(piece.now_error_mw),
-        'flow_mw': _number(piece.flow_mw),
-        'smallest_seen_mw': _number(piece.smallest_mw),
-    }
+    values = {key: getattr(piece, _KEYS.get(key, key)) for key in _PIECE}
+    return {key: v if key == 'moved' else number(v) for key, v in values.items()}
 
 
 def shift_json(shift: Shift) -> dict[str, Any]:

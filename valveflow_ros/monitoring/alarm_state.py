@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import ClassVar, NamedTuple
 
-import numpy as np
-
+from valveflow_ros.curve.shift import minute
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.state import Memory, State
@@ -105,10 +104,8 @@ class AlarmStateMachine(Memory):
     ----------
     active : bool
         True if the condition holds.
-    occurrence : int
-        How many times the condition has begun.
-    raised_ns : int
-        Time when it last began; 0 if never.
+    occurrence, raised_ns : int
+        How many times the condition has begun, and when it last did; 0 if never.
     shelved_until_ns : int or None
         Time when the shelving ends automatically; None if it is not shelved.
     """
@@ -176,8 +173,6 @@ class AlarmStateMachine(Memory):
         return True
 
 
-# Rate limit of the announcements of one alarm: a chattering alarm must not hide the others.
-
 _WINDOW_NS = 600 * NS_PER_S
 # Three announcements within a minute are chattering.
 _MINUTE_NS = 60 * NS_PER_S
@@ -185,9 +180,10 @@ _CHATTER = 3
 
 
 class FloodLimit(Memory):
-    """Limit the announcements of one alarm, based on the time of the samples.
+    """Limit the announcements of one alarm: a chattering one must not hide the others.
 
-    The first one always passes: only recent announcements can hold another one back.
+    The time is that of the samples. The first one always passes: only recent announcements can
+    hold another one back.
 
     Attributes
     ----------
@@ -205,20 +201,11 @@ class FloodLimit(Memory):
         self._times_ns: list[int] = []
 
     @property
-    def free_ns(self) -> int | None:
-        """Return the time from which the next one may pass; None if at any time."""
+    def free_ns(self) -> int:
+        """Return the time from which the next one may pass; 0 if at any time."""
         times = self._times_ns
-        free = [
-            times[-count] + span
-            for count, span in ((self.most, _WINDOW_NS), (_CHATTER - 1, _MINUTE_NS))
-            if len(times) >= count
-        ]
-        return max(free, default=None)
-
-    def allows(self, time_ns: int) -> bool:
-        """Return True if an announcement may pass."""
-        free_ns = self.free_ns
-        return free_ns is None or time_ns >= free_ns
+        limits = ((self.most, _WINDOW_NS), (_CHATTER - 1, _MINUTE_NS))
+        return max((times[-n] + span for n, span in limits if len(times) >= n), default=0)
 
     def passed(self, time_ns: int) -> None:
         """Record an announcement."""
@@ -306,14 +293,13 @@ class Alarm(AlarmStateMachine, ABC):
     def due_ns(self) -> int | None:
         """Return the time of the next change or repetition due to time alone; None if never."""
         if self._waits:
-            # None: the limit was raised meanwhile, so the announcement may pass now.
-            return self._flood.free_ns or 0
+            return self._flood.free_ns
         due = (self.shelved_until_ns, self._again_ns)
         return min((ns for ns in due if ns is not None), default=None)
 
     @property
     def _again_ns(self) -> int | None:
-        """Return the time of the next repetition; None if there is none."""
+        """Return the time of the next repetition."""
         if self._others >= BURIED and self._told != AlarmState.NORMAL:
             return self._told_ns
         return self._told_ns + _AGAIN_NS if self.standing else None
@@ -362,7 +348,7 @@ class Alarm(AlarmStateMachine, ABC):
             again_ns = self._again_ns
             due = again_ns is not None and time_ns >= again_ns
             return [self._announced(state, time_ns, model_id)] if due else []
-        if state == AlarmState.UNACKNOWLEDGED and not self._flood.allows(time_ns):
+        if state == AlarmState.UNACKNOWLEDGED and time_ns < self._flood.free_ns:
             self._flood.held += 0 if self._waits else 1
             self._waits = True
             return []
@@ -378,8 +364,11 @@ class Alarm(AlarmStateMachine, ABC):
         self._flood.held, self._waits = 0, False
         previous = state if again else self._before
         self._told, self._told_ns = state, time_ns
-        self._crowd_out()
-        first = self._first_out()
+        for alarm in self._beside:
+            alarm._others += 1
+        self._others = 0
+        standing = [alarm for alarm in self._beside if alarm.standing]
+        first = min(standing, key=lambda alarm: alarm.raised_ns).NAME if standing else ''
         content = self._content(state)
         parts = [
             self._worded(state, previous, content.sentence),
@@ -393,31 +382,19 @@ class Alarm(AlarmStateMachine, ABC):
         )  # fmt: skip
         return self.last
 
-    def _crowd_out(self) -> None:
-        """Count this announcement in the other alarms."""
-        for alarm in self._beside:
-            alarm._others += 1
-        self._others = 0
-
     def _worded(self, state: AlarmState, previous: AlarmState, sentence: str) -> str:
-        """Return the sentence, with the effect of shelving and suppression."""
         until_ns = self.shelved_until_ns
         if until_ns is not None:
-            return f'Shelved until {_utc(until_ns)}; new alarms are not hidden.'
+            return f'Shelved until {minute(until_ns)}; new alarms are not hidden.'
         if state == AlarmState.SUPPRESSED:
             return f'{self._blind()} The alarm keeps its state meanwhile.'
         if previous == state:
-            return f'Active since {_utc(self.raised_ns)}. {sentence}'
+            return f'Active since {minute(self.raised_ns)}. {sentence}'
         if previous == AlarmState.SHELVED:
             return f'No longer shelved. {sentence}'
         if previous == AlarmState.SUPPRESSED:
             return f'The alarm can be judged again. {sentence}'
         return sentence
-
-    def _first_out(self) -> str:
-        """Return the name of the standing alarm that was raised first."""
-        standing = [alarm for alarm in self._beside if alarm.standing]
-        return min(standing, key=lambda alarm: alarm.raised_ns).NAME if standing else ''
 
     def snapshot(self) -> State:
         """Return the state, including the last announcement."""
@@ -430,15 +407,9 @@ class Alarm(AlarmStateMachine, ABC):
 
 
 def _missed(count: int) -> str:
-    """Return a sentence with the number of announcements that were held back."""
     if count <= 0:
         return ''
     return (
         f'The alarm comes and goes: {count} announcement{"" if count == 1 else "s"} '
         f'{"was" if count == 1 else "were"} held back.'
     )
-
-
-def _utc(time_ns: int) -> str:
-    minute = str(np.datetime64(time_ns, 'ns').astype('datetime64[m]'))
-    return f'{minute.replace("T", " ")} UTC'

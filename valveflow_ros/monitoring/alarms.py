@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -53,23 +53,26 @@ _TURNED, _DARKENED, _SEEING, _SET_BACK, _DUE = 1, 2, 4, 8, 16
 _NEVER = (1 << 63) - 1
 
 
+class _Delays(NamedTuple):
+    """Settings of the alarm in the form of the kernel."""
+
+    dead_band: float
+    on_ns: int
+    off_ns: int
+    gap_ns: int  # rows with a larger time difference are separated by a gap
+    dark_ns: int  # without judgement, until suppression
+    back_ns: int  # with judgement, until its end
+
+
 @jit
-def _turns(
-    time_ns: int,
-    v: float,
-    limit: float,
-    dead_band: float,
-    on_ns: int,
-    off_ns: int,
-    memory: IntArray,
-) -> bool:
+def _turns(time_ns: int, v: float, delays: _Delays, memory: IntArray) -> bool:
     """Judge one value; return True if the condition changed."""
     if memory[_ACTIVE] == 0:
-        beyond = v > limit
-        delay = on_ns
+        beyond = v > _LIMIT
+        delay = delays.on_ns
     else:
-        beyond = v < limit * (1.0 - dead_band)
-        delay = off_ns
+        beyond = v < _LIMIT * (1.0 - delays.dead_band)
+        delay = delays.off_ns
     if not beyond:
         memory[_COUNTING] = 0
         return False
@@ -84,9 +87,7 @@ def _turns(
 
 
 @jit
-def _sight(
-    judged: bool, turned: bool, watched_ns: int, dark_ns: int, back_ns: int, memory: IntArray
-) -> int:
+def _sight(judged: bool, turned: bool, watched_ns: int, delays: _Delays, memory: IntArray) -> int:
     """Update how long the alarm could not, or could, be judged; return the resulting event.
 
     Each time reduces the other one, so that a single row has no effect; after enough time with
@@ -96,12 +97,12 @@ def _sight(
     if not judged:
         memory[_JUDGED_NS] = max(0, memory[_JUDGED_NS] - watched_ns)
         memory[_UNJUDGED_NS] += watched_ns
-        if memory[_SUPPRESSED] == 0 and memory[_UNJUDGED_NS] >= dark_ns:
+        if memory[_SUPPRESSED] == 0 and memory[_UNJUDGED_NS] >= delays.dark_ns:
             memory[_SUPPRESSED], memory[_JUDGED_NS] = 1, 0
             return _DARKENED
         return 0
-    memory[_JUDGED_NS] = min(memory[_JUDGED_NS] + watched_ns, back_ns)
-    seen = memory[_JUDGED_NS] >= back_ns
+    memory[_JUDGED_NS] = min(memory[_JUDGED_NS] + watched_ns, delays.back_ns)
+    seen = memory[_JUDGED_NS] >= delays.back_ns
     memory[_UNJUDGED_NS] = 0 if seen else max(0, memory[_UNJUDGED_NS] - watched_ns)
     if memory[_SUPPRESSED] != 0 and (seen or turned):
         memory[_SUPPRESSED] = memory[_UNJUDGED_NS] = 0
@@ -110,29 +111,18 @@ def _sight(
 
 
 @jit
-def _elsewhere(v: float, u: float, limit: float, dead_band: float, span: FloatArray) -> bool:
+def _elsewhere(v: float, u: float, dead_band: float, span: FloatArray) -> bool:
     """Update the range of u where the condition was seen; return True for a calm row outside."""
-    if v > limit:
+    if v > _LIMIT:
         span[0], span[1] = min(span[0], u), max(span[1], u)
-    return v < limit * (1.0 - dead_band) and not span[0] <= u <= span[1]
+    return v < _LIMIT * (1.0 - dead_band) and not span[0] <= u <= span[1]
 
 
 @jit
 def _watch(
-    time_ns: IntArray,
-    value: FloatArray,
-    u: FloatArray,
-    limit: float,
-    dead_band: float,
-    on_ns: int,
-    off_ns: int,
-    gap_ns: int,
-    dark_ns: int,
-    back_ns: int,
-    due_ns: int,
-    memory: IntArray,
-    span: FloatArray,
-) -> int:
+    time_ns: IntArray, value: FloatArray, u: FloatArray, delays: _Delays, due_ns: int,
+    memory: IntArray, span: FloatArray,
+) -> int:  # fmt: skip
     """Process rows until an event; return the index of the row after it, or 0.
 
     NaN does not change the condition: bad data neither raise nor clear the alarm. A
@@ -143,24 +133,24 @@ def _watch(
     for t in range(value.size):
         step_ns = time_ns[t] - memory[_LAST_NS]
         memory[_LAST_NS] = time_ns[t]
-        watched = 0 < step_ns <= gap_ns
+        watched = 0 < step_ns <= delays.gap_ns
         if not watched:
             memory[_COUNTING] = 0
         v = abs(value[t])
         judged = not math.isnan(v)
         turned = False
-        if judged and v < CALM * limit:
+        if judged and v < CALM * _LIMIT:
             memory[_CALM_NS] = time_ns[t]
         if judged and memory[_ACTIVE] == 0:
-            turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)
+            turned = _turns(time_ns[t], v, delays, memory)
             if turned:
                 span[:] = u[t]
-        elif judged and not _elsewhere(v, u[t], limit, dead_band, span):
-            turned = _turns(time_ns[t], v, limit, dead_band, on_ns, off_ns, memory)
+        elif judged and not _elsewhere(v, u[t], delays.dead_band, span):
+            turned = _turns(time_ns[t], v, delays, memory)
         else:
             # Delays pause while there is nothing to judge.
             memory[_SINCE] += step_ns
-        what = _sight(judged, turned, step_ns if watched else 0, dark_ns, back_ns, memory)
+        what = _sight(judged, turned, step_ns if watched else 0, delays, memory)
         if turned:
             what += _TURNED
         if step_ns <= 0:
@@ -216,26 +206,22 @@ class ResidualAlarm(Alarm):
     def configure(self, settings: Settings) -> None:
         """Apply new settings; states and counters stay."""
         super().configure(settings)
-        self._dead_band = settings.real('alarm_dead_band')
-        self._on_ns = round(settings.real('alarm_on_delay') * NS_PER_S)
-        self._off_ns = round(settings.real('alarm_off_delay') * NS_PER_S)
-        self._gap_ns = round(1.5 * settings.real('sample_period') * NS_PER_S)
-        self._dark_ns = round(settings.real('alarm_suppress_time') * NS_PER_S)
+        block_s, off_s = settings.real('alarm_block'), settings.real('alarm_off_delay')
         # At least one block, because earlier evidence contains old data. The return delay may be a
         # day, but the suppression must not last that long.
-        block_s = settings.real('alarm_block')
-        lasting_s = min(settings.real('alarm_off_delay'), _BLOCKS_TO_SEE * block_s)
-        self._back_ns = round(max(block_s, lasting_s) * NS_PER_S)
+        back_s = max(block_s, min(off_s, _BLOCKS_TO_SEE * block_s))
+        seconds = (
+            settings.real('alarm_on_delay'), off_s, 1.5 * settings.real('sample_period'),
+            settings.real('alarm_suppress_time'), back_s,
+        )  # fmt: skip
+        self._delays = _Delays(
+            settings.real('alarm_dead_band'), *(round(s * NS_PER_S) for s in seconds)
+        )
 
     def restore(self, saved: State) -> None:
         """Continue from a saved state; earlier versions did not store the range of u."""
-        saved = {
-            'returned_ns': None,
-            'longer': 1,
-            'left_mw': 0.0,
-            **saved.get('life', {}),
-            **saved,
-        }
+        new = {'returned_ns': None, 'longer': 1, 'left_mw': 0.0}
+        saved = {**new, **saved.get('life', {}), **saved}
         memory = saved.get('memory')
         if 'span' not in saved and isinstance(memory, np.ndarray):
             saved = {
@@ -268,11 +254,8 @@ class ResidualAlarm(Alarm):
         Parameters
         ----------
         time_ns : int64 (n,)
-        evidence : float64 (n,)
-            NaN if there is nothing to judge.
-        shift_mw : float64 (n,)
-            The shift that corresponds to the evidence, for the sentence.
-        model_id : str
+        evidence, shift_mw : float64 (n,)
+            NaN if there is nothing to judge; the corresponding shift, for the sentence.
         beside : sequence of Alarm
             Other alarms, whose time advances row by row as well.
         u : float64 (n,), optional
@@ -284,11 +267,10 @@ class ResidualAlarm(Alarm):
         done = 0
         while done < len(time_ns):
             due = [alarm.due_ns for alarm in everyone]
+            delays = self._delays._replace(off_ns=self._longer * self._delays.off_ns)
             taken = _watch(
-                time_ns[done:], evidence[done:], u[done:], _LIMIT, self._dead_band,
-                self._on_ns, self._longer * self._off_ns, self._gap_ns, self._dark_ns,
-                self._back_ns, min((d for d in due if d is not None), default=_NEVER),
-                self._memory, self._span,
+                time_ns[done:], evidence[done:], u[done:], delays,
+                min((d for d in due if d is not None), default=_NEVER), self._memory, self._span,
             )  # fmt: skip
             if not taken:
                 break
@@ -306,7 +288,6 @@ class ResidualAlarm(Alarm):
             self._returned_ns += step_ns
 
     def _happened(self, now_ns: int, everyone: Sequence[Alarm]) -> None:
-        """Update the alarms for the events at a row."""
         what = int(self._memory[_WHAT])
         if what & _SET_BACK:
             for alarm in everyone:
@@ -318,7 +299,7 @@ class ResidualAlarm(Alarm):
         if what & _TURNED and self._memory[_ACTIVE]:
             self.onset_ns = int(self._memory[_CALM_NS])
             before_ns = self._returned_ns
-            again = before_ns is not None and now_ns - before_ns <= _SOON * self._off_ns
+            again = before_ns is not None and now_ns - before_ns <= _SOON * self._delays.off_ns
             self._longer = min(2 * self._longer, _LONGEST) if again else 1
             self._left_mw = self.judged.shift_mw
             self.begin(now_ns)
@@ -339,7 +320,7 @@ class ResidualAlarm(Alarm):
         return Content(value, _LIMIT, '', sentence)
 
     def _blind(self) -> str:
-        minutes = self._dark_ns / (60.0 * NS_PER_S)
+        minutes = self._delays.dark_ns / (60.0 * NS_PER_S)
         return (
             f'The residual could not be judged for {minutes:g} min: inputs are bad, or the valve '
             'is outside the curve.'
@@ -347,31 +328,26 @@ class ResidualAlarm(Alarm):
 
 
 def _sentence(state: AlarmState, shift_mw: float, onset_ns: int) -> str:
-    """Return a sentence about the change that tells an operator what to do."""
-    side = 'more' if shift_mw > 0.0 else 'less'
     known = abs(shift_mw) > 0.0
+    size = f'{abs(shift_mw):.1f} MW {"more" if shift_mw > 0.0 else "less"}'
     since = f', since about {minute(onset_ns)}' if onset_ns > 0 else ''
     if state == AlarmState.UNACKNOWLEDGED and not known:
         return 'The unit does not follow its valve curve; the difference in MW is not known.'
     if state == AlarmState.UNACKNOWLEDGED:
         return (
-            f'The unit gives {abs(shift_mw):.1f} MW {side} than its valve curve (mean over the '
-            f'loads seen){since}. '
+            f'The unit gives {size} than its valve curve (mean over the loads seen){since}. '
             'Check what changed then. If the change was intended, request a new curve (~/refit).'
         )
     if state == AlarmState.ACKNOWLEDGED and not known:
         return 'Acknowledged; the difference in MW is not known yet.'
     if state == AlarmState.ACKNOWLEDGED:
         return (
-            f'Acknowledged; the unit still gives {abs(shift_mw):.1f} MW {side} than its valve '
-            'curve (mean over the loads seen).'
+            f'Acknowledged; the unit still gives {size} than its valve curve (mean over the loads '
+            'seen).'
         )
     if state == AlarmState.RETURNED_UNACKNOWLEDGED:
         return 'The unit follows the valve curve again; acknowledge to clear the alarm.'
     return 'The unit follows the valve curve.'
-
-
-# The alarm on a shift of the curve: states as for the residual alarm, one judgement per curve.
 
 
 # A reported shift ends only when its p-value exceeds ten times the limit for reporting it.
@@ -394,19 +370,13 @@ _SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 class ShiftAlarm(Alarm):
     """Raise an alarm if adopted curves differ from the reference.
 
-    Notes
-    -----
     The states are those of ISA-18.2, as for the residual alarm, but without delays: a curve is
     based on days of data. So it is suppressed if a curve cannot be judged, not by minutes of bad
     data. Two consecutive judgements must find the shift, unless it is large. If the loads in the
     window no longer cover a shifted piece, the alarm stands until its range of u is judged again,
     or until a new reference is set. The alarm is announced again if the size of the shift changes:
-    the first curves after a change are inaccurate.
-
-    Parameters
-    ----------
-    settings : Settings, optional
-        Settings given with a later judgement replace them.
+    the first curves after a change are inaccurate. Settings given with a judgement replace earlier
+    ones.
     """
 
     NAME = 'curve_shift'
@@ -416,10 +386,8 @@ class ShiftAlarm(Alarm):
     )  # fmt: skip
 
     def __init__(self, settings: Settings | None = None) -> None:
-        self._value = 0.0
-        self._limit = 0.0
-        self._sentence = ''
-        self._problem = ''
+        self._value = self._limit = 0.0
+        self._sentence = self._problem = ''
         self._ranges: list[tuple[float, float]] = []
         self._seen: list[list[float]] = []  # u and MW of the shifted pieces at the last judgement
         self._seen_ns = 0
@@ -450,8 +418,7 @@ class ShiftAlarm(Alarm):
     ) -> list[AlarmChange]:
         """Suppress the alarm, because a curve could not be judged, until the next judgement."""
         self.configure(settings)
-        self._problem = problem
-        self.suppressed = True
+        self._problem, self.suppressed = problem, True
         return self._tell(time_ns, model_id)
 
     def restore(self, saved: State) -> None:
@@ -471,7 +438,7 @@ class ShiftAlarm(Alarm):
 
     @property
     def _again_ns(self) -> int | None:
-        """Return the time of the next repetition: now, if the announced size is out of date."""
+        """Return now if the announced size is out of date."""
         told = self.last
         if self.active and told is not None and self.state == told.state in _SHOWN:
             surely = max(_ANOTHER * abs(told.value), 0.5 * self._limit)
@@ -500,9 +467,14 @@ class ShiftAlarm(Alarm):
         if worst is not None:
             self._value, self._limit = worst.shift_mw, worst.smallest_mw
             self._sentence = shift.sentence
-        self._remember(shift, settings)
-        doubt = any(_stands(p, settings) for p in shift.pieces)
-        if not doubt and not self._ranges:
+        # Ranges that were judged again are replaced.
+        settled = [
+            p for p in shift.pieces
+            if p.moved or (math.isfinite(p.smallest_mw) and not _stands(p, settings))
+        ]  # fmt: skip
+        self._ranges = [r for r in self._ranges if not _covered(r, settled)]
+        self._ranges += [(p.u_from, p.u_to) for p in shift.pieces if p.moved]
+        if not self._ranges and not any(_stands(p, settings) for p in shift.pieces):
             self._end(shift.sentence)
 
     def _confirmed(self, shift: Shift, seen: list[list[float]]) -> bool:
@@ -518,15 +490,6 @@ class ShiftAlarm(Alarm):
             for p in shift.pieces
             if p.moved
         )
-
-    def _remember(self, shift: Shift, settings: Settings) -> None:
-        """Store the ranges that shifted; remove older ones that were judged again."""
-        settled = [
-            p for p in shift.pieces
-            if p.moved or (math.isfinite(p.smallest_mw) and not _stands(p, settings))
-        ]  # fmt: skip
-        self._ranges = [r for r in self._ranges if not _covered(r, settled)]
-        self._ranges += [(p.u_from, p.u_to) for p in shift.pieces if p.moved]
 
     def _content(self, state: AlarmState) -> Content:
         sentence = self._sentence or 'No piece of the curve is known to have changed.'
@@ -568,13 +531,7 @@ _NOTHING_TO_DO_TO = {
 
 
 class Alarms:
-    """All alarms of the monitor, in one list.
-
-    Parameters
-    ----------
-    residual : ResidualAlarm
-    shift : ShiftAlarm
-    """
+    """All alarms of the monitor, in one list."""
 
     def __init__(self, residual: ResidualAlarm, shift: ShiftAlarm) -> None:
         self._residual, self._shift = residual, shift
@@ -598,17 +555,9 @@ class Alarms:
     def operate(
         self, action: AlarmAction, judged: Judged, model_id: str, name: str | None = None
     ) -> list[AlarmChange]:
-        """Apply an operator action to one alarm or to all; return the announcements.
+        """Apply an operator action to the alarm of a name, or to all; return the announcements.
 
-        Parameters
-        ----------
-        action : AlarmAction
-        judged : Judged
-            The last judged time, evidence and shift.
-        model_id : str
-            Identifier of the curve used for it.
-        name : str, optional
-            Name of the alarm; None for all.
+        ``judged`` is the last one, by the curve ``model_id``.
 
         Raises
         ------

@@ -17,8 +17,6 @@ from valveflow_ros.records import NS_PER_S, ByteArray, IntArray
 from valveflow_ros.segments.window import RollingWindow
 from valveflow_ros.state import Memory, State
 
-# The status of the running curve.
-
 
 class CurveStatus(enum.IntEnum):
     """The status of the running curve; the message uses the same numbers.
@@ -36,14 +34,10 @@ class CurveStatus(enum.IntEnum):
 
 
 class RunningCurve:
-    """Holds the curve of the last fit, and the predictor.
+    """The curve of the last fit, and the predictor.
 
     If there is a reference, it gives the predictions: a curve fitted to a fault would hide the
     fault.
-
-    Parameters
-    ----------
-    settings : Settings
 
     Attributes
     ----------
@@ -131,9 +125,6 @@ class RunningCurve:
         self.status, self.cause = CurveStatus(saved['status']), saved['cause']
 
 
-# Time of the next fit request, and the pending request.
-
-
 class Refits(Memory):
     """Count segments and time until the next request, and name requests.
 
@@ -177,17 +168,9 @@ class Refits(Memory):
     ) -> bool:
         """Return True if the time or the segments since the last request require a new one.
 
-        Parameters
-        ----------
-        last_ns : int
-            Time of the newest row.
-        closed : bool
-            A segment closed at that row.
-        by_time : bool
-            The period ended at that row.
-        settings : Settings
-        segments : int
-            Number available to a fit. Some must be new: otherwise the curve would not change.
+        At the newest row, of ``last_ns``, a segment may have ``closed`` or the period ended
+        (``by_time``). Some of the ``segments`` available to a fit must be new: otherwise the curve
+        would not change.
         """
         if by_time:
             self._last_ns = last_ns

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,15 +45,21 @@ _HOUR_NS = 3600 * NS_PER_S
 _DAY_NS = 24 * _HOUR_NS
 # Below this fraction of the limit the model fits again.
 _RETURN = 0.7
+# What is remembered as numbers.
+_NUMBERS = 'hour', 'night', 'night_before', 'asked_ns', 'named_ns'
 
 
-class Journal(Protocol):
-    """Write a line of the journal at the current row."""
+# Writes a line of the journal at the current row: kind, request_ns, model_id, text.
+Journal = Callable[[JournalKind, int, str, str], JournalEntry]
 
-    def __call__(
-        self, kind: JournalKind, request_ns: int, model_id: str, text: str
-    ) -> JournalEntry:
-        """Return the line."""
+
+class _Now(NamedTuple):
+    """What a diagnosis at the newest row gets; earlier rows than ``since_ns`` are not used."""
+
+    time_ns: int
+    window: RollingWindow
+    curve: Characteristic | None
+    since_ns: int
 
 
 class _Found(NamedTuple):
@@ -66,12 +73,7 @@ class _Found(NamedTuple):
 class DiagnosisRequests:
     """Check whether the model fits, request diagnoses, and keep the last one.
 
-    Parameters
-    ----------
-    settings : Settings
-    alarm : ResidualAlarm
-        While it is raised, the power differs from the curve.
-    journal : Journal
+    While ``alarm`` is raised, the power differs from the curve.
 
     Attributes
     ----------
@@ -137,14 +139,7 @@ class DiagnosisRequests:
     ) -> list[Event]:
         """At the first row of an hour, judge the model and request a diagnosis if needed.
 
-        Parameters
-        ----------
-        time_ns : int
-            Time of the newest row.
-        window : RollingWindow
-        curve : Characteristic or None
-        since_ns : int
-            Earlier rows are not used.
+        ``time_ns`` is that of the newest row; rows before ``since_ns`` are not used.
         """
         hour = time_ns // _HOUR_NS
         if hour == self._hour:
@@ -158,11 +153,9 @@ class DiagnosisRequests:
         reason = self._wanted or (NIGHTLY if tonight else '')
         if not reason and self._found.unsure and self._young(time_ns):
             reason = MORE_DATA
-        if (
-            reason and self._may_ask(time_ns)
-            and not self._objection(time_ns, window, curve, since_ns)
-        ):  # fmt: skip
-            events += self._ask(reason, time_ns, window, curve, since_ns)
+        now = _Now(time_ns, window, curve, since_ns)
+        if reason and self._may_ask(time_ns) and not self._objection(now):
+            events += self._ask(reason, now)
         return events
 
     def request(
@@ -175,10 +168,10 @@ class DiagnosisRequests:
         DataError
             One is running, there is no curve, or there is less than a day of data.
         """
-        objection = self._objection(time_ns, window, curve, since_ns)
-        if objection:
+        now = _Now(time_ns, window, curve, since_ns)
+        if objection := self._objection(now):
             raise DataError(objection)
-        return self._ask(ASKED, time_ns, window, curve, since_ns)
+        return self._ask(ASKED, now)
 
     def adopt(self, request_ns: int, content: str) -> list[Event]:
         """Accept a result; ``content`` is the content of `diagnosis.json`."""
@@ -187,8 +180,7 @@ class DiagnosisRequests:
             return []
         self.last, self._found = Diagnosed(task, content, ''), _found(task, content)
         mark = hashlib.sha256(content.encode()).hexdigest()[:12]
-        kind, model_id = JournalKind.DIAGNOSED, task.curve.model_id
-        return [self.last, self._journal(kind, request_ns, model_id, mark)]
+        return [self.last, self._entry(JournalKind.DIAGNOSED, task, mark)]
 
     def refuse(self, request_ns: int, reason: str) -> list[Event]:
         """Record that a diagnosis gave no result."""
@@ -196,8 +188,10 @@ class DiagnosisRequests:
         if task is None:
             return []
         self.last = Diagnosed(task, '', reason)
-        kind, model_id = JournalKind.DIAGNOSIS_FAILED, task.curve.model_id
-        return [self.last, self._journal(kind, request_ns, model_id, reason)]
+        return [self.last, self._entry(JournalKind.DIAGNOSIS_FAILED, task, reason)]
+
+    def _entry(self, kind: JournalKind, task: DiagnosisTask, text: str) -> JournalEntry:
+        return self._journal(kind, task.request_ns, task.curve.model_id, text)
 
     def snapshot(self) -> State:
         """Return the state. Tasks are stored without their rows."""
@@ -208,11 +202,7 @@ class DiagnosisRequests:
             'sentence': self.sentence,
             'last': None if last is None else [_plain(last.task), last.content, last.reason],
             'found': list(self._found),
-            'hour': self._hour,
-            'night': self._night,
-            'night_before': self._night_before,
-            'asked_ns': self._asked_ns,
-            'named_ns': self._named_ns,
+            **{name: getattr(self, f'_{name}') for name in _NUMBERS},
             'wanted': self._wanted,
             'raised': self._raised,
             'pending': None if pending is None else _plain(pending),
@@ -232,10 +222,8 @@ class DiagnosisRequests:
         elif self.last is not None and self.last.content:  # of an earlier version
             self._found = _found(self.last.task, self.last.content)
         self._pending = None if pending is None else self._task(pending)
-        self._hour, self._night, self._night_before, self._asked_ns, self._named_ns = (
-            perhaps(saved, name, int)
-            for name in ('hour', 'night', 'night_before', 'asked_ns', 'named_ns')
-        )
+        for name in _NUMBERS:
+            setattr(self, f'_{name}', perhaps(saved, name, int))
         self._wanted, self._raised = saved['wanted'], saved['raised']
 
     def _task(self, plain: State) -> DiagnosisTask:
@@ -286,7 +274,6 @@ class DiagnosisRequests:
         return wanted and 0 <= time_ns - self._alarm.raised_ns < _DAY_NS
 
     def _want(self, reason: str) -> None:
-        """Schedule a diagnosis as soon as possible."""
         if self.settings.flag('diagnosis_on_mismatch'):
             self._wanted = reason
 
@@ -299,35 +286,27 @@ class DiagnosisRequests:
         # The clock may have gone back to before the last request.
         return self._asked_ns is None or not 0 <= time_ns - self._asked_ns < pause_ns
 
-    def _objection(
-        self, time_ns: int, window: RollingWindow, curve: Characteristic | None, since_ns: int
-    ) -> str:
+    def _objection(self, now: _Now) -> str:
         """Return why a diagnosis is not possible; empty if it is."""
         if self.pending:
             return 'A diagnosis is running already.'
-        if curve is None:
+        if now.curve is None:
             return 'There is no curve to diagnose yet.'
-        span_s = min(window.span_s, (time_ns - since_ns) / NS_PER_S)
+        span_s = min(now.window.span_s, (now.time_ns - now.since_ns) / NS_PER_S)
         if span_s < LEAST_S:
             hours = span_s / 3600.0
             return f'A diagnosis needs a day of data; the window holds {hours:.1f} h.'
         return ''
 
-    def _ask(
-        self, reason: str, time_ns: int, window: RollingWindow, curve: Characteristic | None,
-        since_ns: int,
-    ) -> list[Event]:  # fmt: skip
-        assert curve is not None
+    def _ask(self, reason: str, now: _Now) -> list[Event]:
+        assert now.curve is not None
         # After the clock went back names must not repeat.
-        self._named_ns = max(time_ns, self._named_ns + 1)
-        self._asked_ns, self._wanted = time_ns, ''
-        task = DiagnosisTask(
-            self._named_ns, window.contents(since_ns, covariates=True), self.settings, curve,
-            time_ns,
-        )  # fmt: skip
+        self._named_ns = max(now.time_ns, self._named_ns + 1)
+        self._asked_ns, self._wanted = now.time_ns, ''
+        contents = now.window.contents(now.since_ns, covariates=True)
+        task = DiagnosisTask(self._named_ns, contents, self.settings, now.curve, now.time_ns)
         self._pending = task.without_data()
-        entry = self._journal(JournalKind.DIAGNOSE, task.request_ns, curve.model_id, reason)
-        return [entry, DiagnosisRequested(task)]
+        return [self._entry(JournalKind.DIAGNOSE, task, reason), DiagnosisRequested(task)]
 
     def _settle(self, request_ns: int) -> DiagnosisTask | None:
         """Accept an outcome and return its task; None if it was not expected."""
@@ -367,8 +346,5 @@ def onset_ns(content: str) -> int | None:
 
 def _plain(task: DiagnosisTask) -> State:
     """Return a task without its rows as plain values."""
-    return {
-        'request_ns': task.request_ns,
-        'curve': to_json(task.curve),
-        'window_end_ns': task.window_end_ns,
-    }
+    curve = to_json(task.curve)
+    return {'request_ns': task.request_ns, 'curve': curve, 'window_end_ns': task.window_end_ns}

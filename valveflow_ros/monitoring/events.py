@@ -16,30 +16,16 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SpecialSegment
 from valveflow_ros.segments.window import NO_ROWS, WindowContents
 
-# The input of a diagnosis.
-
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisTask:
-    """All inputs of a diagnosis.
+    """All inputs of a diagnosis."""
 
-    Attributes
-    ----------
-    request_ns : int
-        Time of the last row before the request; its name.
-    contents : WindowContents
-    settings : Settings
-    curve : Characteristic
-        The current curve, used as the initial model.
-    window_end_ns : int
-        Time of the newest row in the window.
-    """
-
-    request_ns: int
+    request_ns: int  # time of the last row before the request; its name
     contents: WindowContents
     settings: Settings
-    curve: Characteristic
-    window_end_ns: int
+    curve: Characteristic  # the current one, used as the initial model
+    window_end_ns: int  # time of the newest row in the window
 
     def without_data(self) -> DiagnosisTask:
         """Return a copy without rows, to identify the request."""
@@ -128,17 +114,7 @@ class DiagnosisRequested:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosed:
-    """A diagnosis has ended.
-
-    Attributes
-    ----------
-    task : DiagnosisTask
-        The input of the diagnosis.
-    content : str
-        Content of `diagnosis.json`; empty if there is no result.
-    reason : str
-        Why there is no result.
-    """
+    """A diagnosis has ended: with the ``content`` of `diagnosis.json`, or without for a reason."""
 
     task: DiagnosisTask
     content: str
@@ -146,13 +122,6 @@ class Diagnosed:
 
 
 Event = (
-    PredictionBlock
-    | SegmentClosed
-    | FitRequested
-    | CurveAdopted
-    | ReferenceSet
-    | DiagnosisRequested
-    | Diagnosed
-    | AlarmChange
-    | JournalEntry
-)
+    PredictionBlock | SegmentClosed | FitRequested | CurveAdopted | ReferenceSet
+    | DiagnosisRequested | Diagnosed | AlarmChange | JournalEntry
+)  # fmt: skip

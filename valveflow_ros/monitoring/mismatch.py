@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,6 @@ from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray
 from valveflow_ros.state import Memory
-
-# One pass over rows: means of a minute, their regressors, and sums with exponential forgetting.
 
 MINUTE_NS = 60 * NS_PER_S
 BLOCK_NS = 7200 * NS_PER_S
@@ -55,6 +53,21 @@ MINUTE = 7
 POWER, COUNT, MEAN_T, WEIGHT_T, PLAY, PAST = range(6)
 STATE = PAST + MOVES + 1
 AT_MINUTE, AT_BLOCK, BLOCKS = range(3)
+
+
+class _Curve(NamedTuple):
+    knots: FloatArray
+    left: FloatArray
+    right: FloatArray
+
+
+class _Sums(NamedTuple):
+    place: IntArray  # number of the current minute and block, -1 before the first; ended blocks
+    minute: FloatArray  # (MINUTE,)
+    state: FloatArray  # (STATE,)
+    block: FloatArray  # (FEATURES, 3)
+    kept: FloatArray  # (FEATURES, KEPT)
+    z: FloatArray  # (FEATURES,)
 
 
 @jit
@@ -89,19 +102,17 @@ def _warm(state: FloatArray, minute: FloatArray) -> float:
 
 
 @jit
-def _features(
-    middle_ns: int, minute: FloatArray, state: FloatArray, knots: FloatArray, left: FloatArray,
-    right: FloatArray, z: FloatArray,
-) -> None:  # fmt: skip
+def _features(middle_ns: int, f: _Curve, sums: _Sums) -> None:
     """Write the regressor of each statistic for the residual of a minute."""
+    minute, state, z = sums.minute, sums.state, sums.z
     good = minute[_GOOD]
     x, answer, u = minute[_X] / good, minute[_D] / good, minute[_U] / good
-    low, high = knots[0], knots[-1]
+    low, high = f.knots[0], f.knots[-1]
     step = 1e-3 * (high - low)
     below, above = max(low, u - step), min(high, u + step)
-    rise = curve(above, knots, left, right) - curve(below, knots, left, right)
+    rise = curve(above, f.knots, f.left, f.right) - curve(below, f.knots, f.left, f.right)
     swing = u * rise / max(above - below, 1e-12)
-    whole = max(abs(right[-1]), abs(left[0]), 1e-9)
+    whole = max(abs(f.right[-1]), abs(f.left[0]), 1e-9)
     share = min(max((u - low) / (high - low), 0.0), 1.0)
     z[:] = 0.0
     z[OFFSET] = 1.0
@@ -127,12 +138,10 @@ def _features(
 
 
 @jit
-def _end_minute(
-    middle_ns: int, minute: FloatArray, state: FloatArray, knots: FloatArray, left: FloatArray,
-    right: FloatArray, block: FloatArray, z: FloatArray,
-) -> None:  # fmt: skip
+def _end_minute(middle_ns: int, f: _Curve, sums: _Sums) -> None:
     """Add a complete minute to the block."""
-    _features(middle_ns, minute, state, knots, left, right, z)
+    minute, state, block, z = sums.minute, sums.state, sums.block, sums.z
+    _features(middle_ns, f, sums)
     r = minute[_R] / minute[_GOOD]
     state[POWER] += r * r
     state[COUNT] += 1.0
@@ -144,8 +153,9 @@ def _end_minute(
 
 
 @jit
-def _end_block(follows: int, block: FloatArray, kept: FloatArray, state: FloatArray) -> None:
+def _end_block(follows: int, sums: _Sums) -> None:
     """Add a block to the sums; ``follows`` is the number of blocks until the next one."""
+    block, kept, state = sums.block, sums.kept, sums.state
     forget = math.exp(-follows / MEMORY_BLOCKS)
     twice = forget * forget
     state[POWER] *= forget
@@ -169,44 +179,22 @@ def _end_block(follows: int, block: FloatArray, kept: FloatArray, state: FloatAr
 
 
 @jit
-def run(
-    time_ns: IntArray,
-    u: FloatArray,
-    temperature: FloatArray,
-    static: FloatArray,
-    dynamic: FloatArray,
-    residual: FloatArray,
-    minute_ns: int,
-    least: int,
-    knots: FloatArray,
-    left: FloatArray,
-    right: FloatArray,
-    place: IntArray,
-    minute: FloatArray,
-    state: FloatArray,
-    block: FloatArray,
-    kept: FloatArray,
-    z: FloatArray,
-) -> None:
+def _run(
+    time_ns: IntArray, u: FloatArray, temperature: FloatArray, static: FloatArray,
+    dynamic: FloatArray, residual: FloatArray, minute_ns: int, least: int, f: _Curve, sums: _Sums,
+) -> None:  # fmt: skip
     """Process rows; a minute or block ends with the first row after it.
 
-    Parameters
-    ----------
-    minute_ns : int
-        Length of a minute; longer if the step of the rows is longer.
-    least : int
-        Number of rows that a minute needs to count.
-    place : int64 (3,)
-        Number of the current minute and block, -1 before the first, and count of ended blocks.
-    minute (MINUTE,), state (STATE,), block (FEATURES, 3), kept (FEATURES, KEPT), z (FEATURES,)
-        The state, and work arrays.
+    ``minute_ns`` is longer than a minute if the step of the rows is; a minute counts if it has
+    ``least`` rows.
     """
+    place, minute, state = sums.place, sums.minute, sums.state
     for t in range(u.size):
         now = time_ns[t] // minute_ns
         if now != place[AT_MINUTE]:
             if minute[_GOOD] >= least:
                 middle_ns = place[AT_MINUTE] * minute_ns + minute_ns // 2
-                _end_minute(middle_ns, minute, state, knots, left, right, block, z)
+                _end_minute(middle_ns, f, sums)
             else:
                 _forget_past(state)
             if now != place[AT_MINUTE] + 1:
@@ -214,7 +202,7 @@ def run(
             minute[:] = 0.0
             here = time_ns[t] // BLOCK_NS
             if place[AT_BLOCK] >= 0 and here > place[AT_BLOCK]:
-                _end_block(here - place[AT_BLOCK], block, kept, state)
+                _end_block(here - place[AT_BLOCK], sums)
                 place[BLOCKS] += 1
             place[AT_MINUTE], place[AT_BLOCK] = now, here
         if math.isfinite(residual[t]):
@@ -240,36 +228,19 @@ NAMES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Misfit:
-    """The largest statistic.
+class Misfit(NamedTuple):
+    """The largest statistic; `NOTHING` if nothing can be judged."""
 
-    Attributes
-    ----------
-    score : float
-        Signed, as a standard normal deviate; 0 if nothing can be judged.
-    name : str
-        One of `NAMES`; empty if nothing can be judged.
-    hint : str
-        Variable on which the residual depends, as the end of a sentence.
-    """
-
-    score: float
-    name: str
-    hint: str
+    score: float  # signed, as a standard normal deviate
+    name: str  # one of `NAMES`
+    hint: str  # variable on which the residual depends, as the end of a sentence
 
 
 NOTHING = Misfit(0.0, '', '')
 
 
 class Mismatch(Memory):
-    """Recursive statistics of the residual, with constant memory and time per row.
-
-    Parameters
-    ----------
-    step_s : float
-        Step of the rows.
-    """
+    """Recursive statistics of the residual, with constant memory and time per row."""
 
     REMEMBERED = ('_place', '_minute', '_z', '_state', '_block', '_kept', '_ends')
 
@@ -286,20 +257,13 @@ class Mismatch(Memory):
     def feed(
         self, block: PredictionBlock, temperature_degc: FloatArray, model: RegionalModel
     ) -> None:
-        """Process rows that ``model`` has predicted; the statistics continue with a new model.
-
-        Parameters
-        ----------
-        block : PredictionBlock
-        temperature_degc : float64 (n,)
-            Main steam temperature of the same rows.
-        model : RegionalModel
-        """
+        """Process rows that ``model`` has predicted; the statistics continue with a new model."""
         self._ends = float(model.knots[0]), float(model.knots[-1])
-        run(
+        _run(
             block.time_ns, block.u, temperature_degc, block.static_mw, block.dynamic_mw,
-            block.residual_mw, self._minute_ns, self._least, model.knots, model.left, model.right,
-            self._place, self._minute, self._state, self._block, self._kept, self._z,
+            block.residual_mw, self._minute_ns, self._least,
+            _Curve(model.knots, model.left, model.right),
+            _Sums(self._place, self._minute, self._state, self._block, self._kept, self._z),
         )  # fmt: skip
 
     def scores(self) -> FloatArray:
@@ -325,9 +289,8 @@ class Mismatch(Memory):
 
     def _size(self) -> FloatArray:
         """Return the root mean square of each regressor."""
-        kept = self._kept
-        count = np.maximum(kept[:, SUM_N], 1.0)
-        return np.asarray(np.sqrt(kept[:, SUM_Q] / count))
+        count = np.maximum(self._kept[:, SUM_N], 1.0)
+        return np.asarray(np.sqrt(self._kept[:, SUM_Q] / count))
 
     def _estimates(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return estimates, their standard errors, and their effective numbers of blocks."""

@@ -26,12 +26,11 @@ from valveflow_ros.monitoring.events import (
     ReferenceSet,
     SegmentClosed,
 )
-from valveflow_ros.monitoring.prediction import PredictionBlock
 from valveflow_ros.monitoring.reference import ReferenceCurve
 from valveflow_ros.monitoring.rows import Correction, Corrector, Fed, Rows
 from valveflow_ros.parameters import Depends, Settings, parameter
 from valveflow_ros.records import IntArray, SampleTable, SpecialSegment
-from valveflow_ros.segments.segmenter import NoiseLevel, Segmented, Segmenter
+from valveflow_ros.segments.segmenter import NoiseLevel, Segmenter
 from valveflow_ros.segments.window import RollingWindow
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, StaticForm
 from valveflow_ros.state import Memory, State
@@ -55,12 +54,16 @@ class Monitor(Memory):
 
     Parameters
     ----------
-    settings : Settings
     corrector : Corrector, optional
         Removes known causes from the rows before they are used.
     covariates : tuple of str
         Entries of the columns in `SampleTable.covariates`, which the diagnoses try as causes;
         see `signals.covariates`.
+
+    Attributes
+    ----------
+    rows, last_ns : int
+        Number of rows taken so far, and time of the newest; 0 before the first.
 
     Notes
     -----
@@ -73,7 +76,7 @@ class Monitor(Memory):
 
     REMEMBERED = (
         '_correction', '_segmenter', '_window', 'alarm', '_force', '_refits', 'reference',
-        'diagnosing', '_rows', '_last_ns', '_went_back', 'judged', '_chart_due',
+        'diagnosing', 'rows', 'last_ns', '_went_back', 'judged', '_chart_due',
         '_chart_not_ns',
     )  # fmt: skip
 
@@ -89,8 +92,8 @@ class Monitor(Memory):
         self._window = RollingWindow.of(settings, covariates)
         self.alarm = ResidualAlarm(settings)
         self._force = RunningCurve(settings)
-        self._rows = 0
-        self._last_ns = 0
+        self.rows = 0
+        self.last_ns = 0
         self._went_back = False
         self._chart_due = False  # the chart parameters have changed
         self._chart_not_ns: int | None = None  # a request from before that change
@@ -99,16 +102,6 @@ class Monitor(Memory):
         self.reference = ReferenceCurve(settings)
         self._alarms = Alarms(self.alarm, self.reference.alarm)
         self.diagnosing = DiagnosisRequests(settings, self.alarm, self._journal)
-
-    @property
-    def rows(self) -> int:
-        """Return the number of rows taken so far."""
-        return self._rows
-
-    @property
-    def last_ns(self) -> int:
-        """Return the time of the newest row, 0 before the first."""
-        return self._last_ns
 
     @property
     def characteristic(self) -> Characteristic | None:
@@ -168,7 +161,7 @@ class Monitor(Memory):
         changed = self.settings.live_changes(settings)
         if not changed:
             return []
-        self.settings = self.diagnosing.settings = settings
+        self.settings = self.diagnosing.settings = self.reference.settings = settings
         self._alarms.configure(settings)
         self._force.configure(settings)
         if changed.keys() & _OF_CHART:
@@ -191,9 +184,7 @@ class Monitor(Memory):
             taken, closed = self._take(rows.part(done, done + most), events)
             done += taken
             # Decisions do not depend on the ends of blocks.
-            looked = self.diagnosing.look(
-                self._last_ns, self._window, self.predicting, self._diagnosed_since()
-            )
+            looked = self.diagnosing.look(*self._diagnosable())
             events += looked
             asked = self._ask() if self._due(closed, by_time and taken == until) else []
             events += asked
@@ -216,17 +207,11 @@ class Monitor(Memory):
         if request_ns != self._chart_not_ns:
             self._take_chart(characteristic)
         segments = self._window.special_segments()
-        shift, changes = self.reference.judge(
-            characteristic, segments, self._last_ns, self.settings
-        )
+        changes = self.reference.judge(characteristic, segments, self.last_ns)
         entry = self._journal(JournalKind.FIT_ADOPTED, request_ns, characteristic.model_id, '')
-        told: list[Event] = [
-            CurveAdopted(characteristic, shift, self._force.cause),
-            entry,
-            *changes,
-        ]
-        events = [*begun, *told, *self._follow_health()]
-        healthy = self.reference.renewed(characteristic, self._last_ns, self.settings)
+        adopted = CurveAdopted(characteristic, self.reference.shift, self._force.cause)
+        events = [*begun, adopted, entry, *changes, *self._follow_health()]
+        healthy = self.reference.renewed(characteristic, self.last_ns)
         if healthy is not None:
             reason = WORN if healthy is self.reference.first else BY_ITSELF
             return [*events, *self._renew(healthy, reason)]
@@ -260,9 +245,7 @@ class Monitor(Memory):
 
     def request_diagnosis(self) -> list[Event]:
         """Request a diagnosis now; raises `DataError` if that is not possible."""
-        return self.diagnosing.request(
-            self._last_ns, self._window, self.predicting, self._diagnosed_since()
-        )
+        return self.diagnosing.request(*self._diagnosable())
 
     def operate_alarms(self, action: AlarmAction, name: str | None = None) -> list[Event]:
         """Acknowledge, shelve or unshelve all alarms, or the one of a name.
@@ -292,8 +275,8 @@ class Monitor(Memory):
         curve = self.characteristic if given is None else given
         if curve is None:
             raise DataError(f'There is no curve that could become the reference. {self.cause}')
-        changes = self.reference.set(curve, self._last_ns, self.settings)
-        changes += self.alarm.reset(self._last_ns, curve.model_id)
+        changes = self.reference.set(curve, self.last_ns)
+        changes += self.alarm.reset(self.last_ns, curve.model_id)
         self._predict(afresh=True)
         text = '' if given is None else json.dumps(to_json(given))
         entry = self._journal(JournalKind.SET_REFERENCE, 0, curve.model_id, text)
@@ -316,17 +299,10 @@ class Monitor(Memory):
         return [*events, self._journal(JournalKind.RESET, 0, '', reason)]
 
     def carry(self, saved: State, then: Settings) -> tuple[str, list[Event]]:
-        """Continue from a state of other settings or another version, as far as possible.
+        """Continue from a state of the settings ``then`` or another version, as far as possible.
 
         Call it before the first row. A few rows may be missing in between, and the time may have
         jumped.
-
-        Parameters
-        ----------
-        saved : State
-            Result of `snapshot`.
-        then : Settings
-            The settings of that state.
 
         Returns
         -------
@@ -380,10 +356,7 @@ class Monitor(Memory):
             raise DataError('The clock has just gone back; try again after the next sample.')
 
     def _take(self, rows: Rows, events: list[Event]) -> tuple[int, bool]:
-        """Process rows up to the end of the next segment.
-
-        Returns the number of rows taken and whether a segment closed at the last one.
-        """
+        """Process rows up to the end of a segment; return their number and whether one closed."""
         segmented = self._segmenter.feed(
             rows.time_ns, rows.u, rows.power_mw, rows.temperature_degc, most=1
         )
@@ -399,37 +372,30 @@ class Monitor(Memory):
         )  # fmt: skip
         block = self._force.predict(rows, segmented.kinds)
         self.diagnosing.watch(block, rows.temperature_degc, self.predicting)
-        self._rows += n
-        self._last_ns = int(rows.time_ns[-1])
-        self.judged = Judged(self._last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
-        self._say(block, segmented, events)
-        return n, bool(segmented.found)
-
-    def _say(self, block: PredictionBlock, segmented: Segmented, events: list[Event]) -> None:
-        """Append the events of the rows; a segment can only close at the last row."""
+        self.rows += n
+        self.last_ns = int(rows.time_ns[-1])
+        self.judged = Judged(self.last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
         events.append(block)
         if self.predicting is not None:
             events += self._alarms.feed(block)
-        self._close(segmented, events)
-
-    def _close(self, segmented: Segmented, events: list[Event]) -> None:
         for _, found in segmented.found:
             self._window.add_segment(found)
             self._refits.segments_seen += 1
             events.append(SegmentClosed(found.segment))
+        return n, bool(segmented.found)
 
     def _due(self, closed: bool, by_time: bool) -> bool:
         """Return True if a fit must be requested at this row."""
         if not (closed or by_time):
             return False
         segments = self._window.special_segments(self.reference.regime_ns)
-        if not self._refits.due(self._last_ns, closed, by_time, self.settings, len(segments)):
+        if not self._refits.due(self.last_ns, closed, by_time, self.settings, len(segments)):
             return False
         return sum(s.samples for s in segments) >= self.settings.whole('min_fit_samples')
 
     def _ask(self, text: str = '') -> list[Event]:
         before = self._follow_health()
-        request_ns = self._refits.ask(self._last_ns)
+        request_ns = self._refits.ask(self.last_ns)
         noise = self._segmenter.noise()
         reference = self.reference.curve
         task = FitTask(
@@ -446,16 +412,15 @@ class Monitor(Memory):
         own_ns = self.alarm.onset_ns if self.alarm.active else None
         onsets = [ns for ns in (named_ns, own_ns) if ns is not None]
         waits = self.alarm.standing or self.reference.alarm.standing
-        begins = self.reference.follow(min(onsets, default=None), waits, self._last_ns)
+        begins = self.reference.follow(min(onsets, default=None), waits, self.last_ns)
         curve = self.characteristic
         if begins and self.reference.curve is None and curve is not None:
             return self._renew(curve, IN_TIME)
         return []
 
     def _renew(self, curve: Characteristic, reason: str) -> list[Event]:
-        """Make a curve the reference automatically."""
         segments = self._window.special_segments(self.reference.regime_ns)
-        self.reference.renew(curve, segments, self._last_ns)
+        self.reference.renew(curve, segments, self.last_ns)
         self._predict()
         entry = self._journal(JournalKind.SET_REFERENCE, 0, curve.model_id, reason)
         return [ReferenceSet(curve), entry]
@@ -472,8 +437,7 @@ class Monitor(Memory):
     def _take_chart(self, curve: Characteristic) -> None:
         """Give the reference the control chart of a new curve, if the chart parameters changed.
 
-        The chart describes the residual of the healthy plant, so the chart of a provisional curve
-        is not used.
+        The chart of a provisional curve does not describe the healthy plant.
         """
         chart = curve.residuals.chart
         if self._chart_due and chart is not None and self.reference.fault_ns is None:
@@ -509,7 +473,6 @@ class Monitor(Memory):
         return parts
 
     def _asks_for_another_form(self, curve: Characteristic | None) -> bool:
-        """Return True if the settings require another form of the curve than the given one has."""
         axis, exponent = self.settings.text('axis'), self.settings.real('pressure_exponent')
         if curve is None or axis == 'auto':
             return False
@@ -536,9 +499,8 @@ class Monitor(Memory):
         if not lost & {'alarm', 'part of reference'}:
             stays.append('the alarms')
         kept = listed(stays).capitalize() or 'Nothing else'
-        return (
-            f'{told} {kept} stay{"" if len(stays) > 1 or "the alarms" in stays else "s"}.'.strip()
-        )
+        ending = '' if len(stays) > 1 or 'the alarms' in stays else 's'
+        return f'{told} {kept} stay{ending}.'.strip()
 
     def _provisional(self) -> str:
         """Return which data the running curve is made from during a fault; empty without one."""
@@ -555,9 +517,10 @@ class Monitor(Memory):
             'is from the data since then. The alarms are judged by the reference.'
         )
 
-    def _diagnosed_since(self) -> int:
-        """Return the first time for a diagnosis: with a fault, also the rows before its onset."""
-        return self.reference.regime_ns if self.reference.fault_ns is None else 0
+    def _diagnosable(self) -> tuple[int, RollingWindow, Characteristic | None, int]:
+        """Return what a diagnosis gets: with a fault, also the rows before its onset."""
+        since_ns = self.reference.regime_ns if self.reference.fault_ns is None else 0
+        return self.last_ns, self._window, self.predicting, since_ns
 
     def _known_form(self) -> StaticForm | None:
         """Return the form of the running curve if it was given in the settings or is scaled."""
@@ -580,7 +543,7 @@ class Monitor(Memory):
     def _journal(
         self, kind: JournalKind, request_ns: int, model_id: str, text: str
     ) -> JournalEntry:
-        return JournalEntry(self._last_ns, kind, request_ns, self._rows, model_id, text)
+        return JournalEntry(self.last_ns, kind, request_ns, self.rows, model_id, text)
 
 
 def _fits(fresh: Monitor, saved: State) -> bool:

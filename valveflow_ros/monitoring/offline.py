@@ -144,8 +144,7 @@ class JournalReplayer:
                 until = min(until, done + self._due[0].rows - self._monitor.rows)
             fed = self._monitor.feed(table.part(done, until))
             done += fed.rows
-            events += fed.events
-            self._keep(fed.events)
+            events += self._keep(fed.events)
 
     def feed_aligned(self, aligned: Aligned) -> list[Event]:
         """Feed rows that contain restarts of the clock; return the events.
@@ -161,15 +160,14 @@ class JournalReplayer:
             start = reset
         return events + self.feed(aligned.table.part(start, len(aligned.table)))
 
-    def _keep(self, events: list[Event]) -> None:
+    def _keep(self, events: list[Event]) -> list[Event]:
+        """Keep the tasks of requests; return the events."""
         for event in events:
             if isinstance(event, DiagnosisRequested):
                 self._diagnosis = event.task
-        self._tasks.update(
-            (event.task.request_ns, event.task)
-            for event in events
-            if isinstance(event, FitRequested)
-        )
+            elif isinstance(event, FitRequested):
+                self._tasks[event.task.request_ns] = event.task
+        return events
 
     def _repeat_due(self) -> list[Event]:
         events: list[Event] = []
@@ -190,13 +188,9 @@ class JournalReplayer:
     def _repeat(self, entry: JournalEntry) -> list[Event]:
         monitor = self._monitor
         if entry.kind == JournalKind.FIT_REQUESTED:
-            events = monitor.request_fit()
-            self._keep(events)
-            return events
+            return self._keep(monitor.request_fit())
         if entry.kind == JournalKind.DIAGNOSE:
-            events = monitor.request_diagnosis()
-            self._keep(events)
-            return events
+            return self._keep(monitor.request_diagnosis())
         if entry.kind == JournalKind.DIAGNOSED:
             return self._conclude(entry)
         if entry.kind == JournalKind.DIAGNOSIS_FAILED:
@@ -250,13 +244,10 @@ class JournalReplayer:
 
 def _from_outside(entry: JournalEntry) -> bool:
     """Return True if the engine would not make this decision from rows alone."""
-    if entry.kind == JournalKind.MISMATCH:
-        return False
-    if entry.kind == JournalKind.FIT_REQUESTED:
-        return entry.text == BY_HAND
     if entry.kind == JournalKind.SET_REFERENCE:
         return entry.text not in OF_ITSELF
-    return entry.kind != JournalKind.DIAGNOSE or entry.text == ASKED
+    by_hand = {JournalKind.FIT_REQUESTED: BY_HAND, JournalKind.DIAGNOSE: ASKED}
+    return entry.kind != JournalKind.MISMATCH and entry.text == by_hand.get(entry.kind, entry.text)
 
 
 def _held(entry: JournalEntry, what: str) -> dict[str, object]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -39,40 +39,21 @@ class PredictionState(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class PredictionBlock:
-    """Predictions for consecutive rows; all arrays have shape (n,).
-
-    Attributes
-    ----------
-    time_ns : int64
-    u : float64
-        Argument of the curve: integrated input, % MPa^m, or opening, %.
-    measured_mw, static_mw, dynamic_mw, residual_mw : float64
-        NaN where unknown. The residual is measured minus dynamic prediction, or
-        minus static prediction in settled rows when no dynamics are known.
-    average_mw : float64
-        The running mean of the residual; NaN before the first.
-    evidence : float64
-        Input of the alarm: beyond 1 or -1 the plant has left the curve; NaN before the first.
-    shift_mw : float64
-        The shift in MW that corresponds to the evidence.
-    state : uint8
-        A `PredictionState`.
-    width_mw : float
-        95 % of the measurements lie within +- this of the prediction; NaN without a curve.
-    model_id : str
-    """
+    """Predictions for consecutive rows; all arrays have shape (n,)."""
 
     time_ns: IntArray
-    u: FloatArray
+    u: FloatArray  # argument of the curve: integrated input, % MPa^m, or opening, %
+    # NaN where unknown. The residual is measured minus dynamic prediction, or minus static
+    # prediction in settled rows when no dynamics are known.
     measured_mw: FloatArray
     static_mw: FloatArray
     dynamic_mw: FloatArray
     residual_mw: FloatArray
-    average_mw: FloatArray
-    evidence: FloatArray
-    shift_mw: FloatArray
-    state: ByteArray
-    width_mw: float
+    average_mw: FloatArray  # running mean of the residual; NaN before the first
+    evidence: FloatArray  # of the alarm: beyond 1 or -1 the plant has left the curve
+    shift_mw: FloatArray  # shift that corresponds to the evidence
+    state: ByteArray  # a `PredictionState`
+    width_mw: float  # 95 % of the measurements lie within +- this; NaN without a curve
     model_id: str
 
     def __len__(self) -> int:
@@ -109,7 +90,6 @@ class _Columns(NamedTuple):
 
 @jit
 def _filter(f: _Filter, x: float) -> None:
-    """Filter one flow value with the dynamics of its region."""
     age = f.place[_AGE]
     place = f.place[_PLACE]
     f.past[place] = x
@@ -123,7 +103,6 @@ def _filter(f: _Filter, x: float) -> None:
 
 @jit
 def _state_of(inside: bool, kind: int) -> int:
-    """Return the `PredictionState` of a row with data."""
     if not inside:
         return 4
     if kind == SETTLED_STEADY:
@@ -136,7 +115,6 @@ def _predict(
     time_ns: IntArray, u: FloatArray, scale: FloatArray, y: FloatArray, kinds: ByteArray,
     f: _Filter, out: _Columns,
 ) -> None:  # fmt: skip
-    """Predict rows."""
     known = f.taps.shape[0] > 0
     for t in range(u.size):
         out.static[t] = out.dynamic[t] = out.residual[t] = np.nan
@@ -173,20 +151,10 @@ def _predict(
 class Predictor(Memory):
     """Predict from one curve, recursively, in constant time per row.
 
-    Parameters
-    ----------
-    characteristic : Characteristic
-    step_s : float
-        Step of the rows.
-    settle_s : float
-        Time after a gap until the dynamic prediction is valid.
-    average_s : float
-        Time constant of the residual's running mean.
-    limit_mw : float
-        If above zero, the evidence is the running mean divided by this limit; otherwise it is
-        that of the control chart of the curve.
-    exponent : float
-        m of the u = V p^m in the rows.
+    After a gap the dynamic prediction is valid from ``settle_s`` on. ``average_s`` is the time
+    constant of the residual's running mean. With a ``limit_mw`` above zero the evidence is this
+    mean divided by the limit; otherwise it is that of the control chart of the curve. ``exponent``
+    is the m of the u = V p^m in the rows.
     """
 
     REMEMBERED = ('_place', '_memory', '_past', '_chart')
@@ -287,24 +255,9 @@ class Predictor(Memory):
         self, time_ns: IntArray, u: FloatArray, scale: FloatArray, power_mw: FloatArray,
         kinds: ByteArray,
     ) -> _Columns:  # fmt: skip
-        n = len(u)
-        out = _Columns(
-            np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.uint8)
-        )
+        out = _Columns(*np.empty((4, len(u))), np.empty(len(u), dtype=np.uint8))
         _predict(time_ns, u, scale, power_mw, kinds, self._filter, out)
         return out
-
-
-def as_measured(block: PredictionBlock, measured_mw: FloatArray) -> PredictionBlock:
-    """Return the predictions of corrected rows as predictions of the measured power.
-
-    The residual stays; the correction of the power is undone in measurement and prediction.
-    """
-    taken_out = measured_mw - block.measured_mw
-    return replace(
-        block, measured_mw=measured_mw, static_mw=block.static_mw + taken_out,
-        dynamic_mw=block.dynamic_mw + taken_out,
-    )  # fmt: skip
 
 
 def no_prediction(
@@ -312,9 +265,7 @@ def no_prediction(
 ) -> PredictionBlock:
     """Return the block for rows without a curve."""
     nan = np.full(len(u), math.nan)
-    state = np.where(
-        kinds == NO_DATA, int(PredictionState.BAD_DATA), int(PredictionState.UNKNOWN)
-    ).astype(np.uint8)
+    state = (PredictionState.BAD_DATA * (kinds == NO_DATA)).astype(np.uint8)
     return PredictionBlock(
         time_ns, u, power_mw, nan, nan, nan, nan, nan, nan, state, math.nan, ''
     )  # fmt: skip

@@ -30,21 +30,11 @@ _KEPT = 400
 
 
 class Wear(NamedTuple):
-    """The slow change of the curve.
+    """The slow change of the curve."""
 
-    Attributes
-    ----------
-    since_ns : int
-        Middle of the data of the first reference.
-    total_mw : float
-        Mean difference of the segments at the last renewal from the first reference.
-    mw_per_month : float
-        Slope of a line through the values since then.
-    """
-
-    since_ns: int
-    total_mw: float
-    mw_per_month: float
+    since_ns: int  # middle of the data of the first reference
+    total_mw: float  # mean difference of the segments at the last renewal from it
+    mw_per_month: float  # slope of a line through the values since then
 
 
 class ReferenceCurve:
@@ -54,10 +44,6 @@ class ReferenceCurve:
     Later curves replace it in the same way: the reference follows slow wear, but never a fault,
     and stays within `wear_budget` of the first one. During a fault, fits use only rows after its
     onset, and afterwards only rows after its end: no curve mixes both.
-
-    Parameters
-    ----------
-    settings : Settings
 
     Attributes
     ----------
@@ -78,6 +64,7 @@ class ReferenceCurve:
     """
 
     def __init__(self, settings: Settings) -> None:
+        self.settings = settings
         self.curve: Characteristic | None = None
         self.shift: Shift | None = None
         self.problem = ''
@@ -122,7 +109,7 @@ class ReferenceCurve:
         self._candidate = None if candidate is None else (candidate[0], from_json(candidate[1]))
         self._worn = [(int(ns), float(mw)) for ns, mw in saved['worn']]
 
-    def set(self, curve: Characteristic, time_ns: int, settings: Settings) -> list[AlarmChange]:
+    def set(self, curve: Characteristic, time_ns: int) -> list[AlarmChange]:
         """Make ``curve`` the reference, even if there is a fault.
 
         Later curves are judged against it, and fits use its form.
@@ -130,28 +117,20 @@ class ReferenceCurve:
         self._take(curve)
         self.set_ns, self.first, self._worn = time_ns, curve, []
         self.fault_ns, self._since_ns = None, 0
-        return self.alarm.reset('There is a new reference.', time_ns, curve.model_id, settings)
+        return self.alarm.reset(
+            'There is a new reference.', time_ns, curve.model_id, self.settings
+        )
 
     def judge(
-        self,
-        current: Characteristic,
-        segments: Sequence[SpecialSegment],
-        time_ns: int,
-        settings: Settings,
-    ) -> tuple[Shift | None, list[AlarmChange]]:
-        """Judge an adopted curve; the shift is None without a comparable reference.
+        self, current: Characteristic, segments: Sequence[SpecialSegment], time_ns: int
+    ) -> list[AlarmChange]:
+        """Judge an adopted curve with the segments of the window, in order of time.
 
-        Parameters
-        ----------
-        current : Characteristic
-        segments : sequence of SpecialSegment
-            The segments of the window, in order of time.
-        time_ns : int
-        settings : Settings
+        `shift` is None without a comparable reference.
         """
-        self.shift, self.problem = None, ''
+        self.shift, self.problem, settings = None, '', self.settings
         if self.curve is None:
-            return None, []
+            return []
         if self.fault_ns is None:
             # A fault that is over is not a shift of the present curve.
             segments = [s for s in segments if s.start_ns >= self.regime_ns]
@@ -165,25 +144,17 @@ class ReferenceCurve:
             self.shift = judge_shift(self.curve, current, segments, limits)
         except DataError as error:
             self.problem = str(error)
-            return None, self.alarm.unjudged(
-                self.problem, time_ns, current.model_id, settings
-            )  # fmt: skip
+            return self.alarm.unjudged(self.problem, time_ns, current.model_id, settings)
         if self.shift.moved and not self.alarm.active:
             # The latest possible time: a curve of rows since then has none of the healthy plant.
             self._since_ns = self.shift.since_high_ns
-        return self.shift, self.alarm.judge(self.shift, time_ns, settings)
+        return self.alarm.judge(self.shift, time_ns, settings)
 
     def follow(self, onset_ns: int | None, waits: bool, time_ns: int) -> bool:
-        """Update whether there is a fault; return True if it has just begun.
+        """Update whether there is a fault at the newest row; return True if it has just begun.
 
-        Parameters
-        ----------
-        onset_ns : int or None
-            Onset of a fault found by the residual alarm or a diagnosis, None if there is none.
-        waits : bool
-            An alarm has returned and is not acknowledged.
-        time_ns : int
-            Time of the newest row.
+        ``onset_ns`` is that of a fault found by the residual alarm or a diagnosis, None if there
+        is none; ``waits`` if an alarm has returned and is not acknowledged.
         """
         onsets = [] if onset_ns is None else [onset_ns]
         if self.alarm.active:
@@ -204,15 +175,14 @@ class ReferenceCurve:
         self.regime_ns = min(self.regime_ns, time_ns)
         self._healthy_ns = min(self._healthy_ns, time_ns)
 
-    def renewed(
-        self, current: Characteristic, time_ns: int, settings: Settings
-    ) -> Characteristic | None:
+    def renewed(self, current: Characteristic, time_ns: int) -> Characteristic | None:
         """Return the curve that becomes the reference now; None if the reference stays."""
         if self.fault_ns is not None or current.source.window_start_ns < self.regime_ns:
             return None
         if self.shift is not None and self.shift.moved:
             return None  # the next curve decides whether this is an alarm
-        if self.first is not None and self._beyond_budget(current, settings):
+        settings = self.settings
+        if self.first is not None and self._beyond_budget(self.first, current):
             self._candidate = None
             worn = self.curve is None or self.curve.model_id != self.first.model_id
             return self.first if worn else None
@@ -268,13 +238,12 @@ class ReferenceCurve:
         self.shift, self.problem = None, ''
         self.alarm.forget()
 
-    def _beyond_budget(self, current: Characteristic, settings: Settings) -> bool:
-        """Return True if the curve differs from the first reference by more than its budget."""
-        assert self.first is not None
-        months = (current.source.window_end_ns - self.first.source.window_end_ns) / MONTH_NS
+    def _beyond_budget(self, first: Characteristic, current: Characteristic) -> bool:
+        settings = self.settings
+        months = (current.source.window_end_ns - first.source.window_end_ns) / MONTH_NS
         most = settings.real('wear_budget') * max(1.0, months) + settings.real('shift_least')
         limits = ShiftLimits(settings.real('shift_confidence'), most)
         try:
-            return judge_shift(self.first, current, (), limits).moved
+            return judge_shift(first, current, (), limits).moved
         except DataError:
             return False

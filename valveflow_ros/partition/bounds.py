@@ -41,7 +41,6 @@ contain a better break.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from valveflow_ros.numerics import inlined, kernel
 from valveflow_ros.partition.moments import (
@@ -97,27 +96,23 @@ def fill_priors(tree: Tree, limit: float, prior: FloatArray) -> None:
         size *= BRANCH
 
 
-@kernel
-def _candidate_costs(
-    leaf: FloatArray,
-    prior: FloatArray,
-    per_width: float,
-    before: FloatArray,
+@inlined
+def about_line(
+    t: FloatArray, hn: float, h1: float, h2: float, a: float, b: float, per_width: float,
     out: FloatArray,
-) -> None:
-    """Fill ``out`` with D + f_B(k0) of a block's candidates and its two slopes."""
-    hn = prior[0]
-    h1 = prior[1]
-    h2 = prior[2]
-    a = prior[3]
-    b = prior[4]
-    for i in range(leaf.shape[1]):
-        n = leaf[0, i]
-        x1 = leaf[1, i]
-        x2 = leaf[2, i]
-        r0 = leaf[3, i] - a * n - b * x1
-        r1 = leaf[4, i] - a * x1 - b * x2
-        r2 = (leaf[5, i] - a * leaf[3, i] - b * leaf[4, i]) - a * r0 - b * r1
+) -> None:  # fmt: skip
+    """Fill ``out`` (3, LEAF) with f_A(k0) of columns of moments and its two tangent slopes.
+
+    The Gram matrix of the prior is (hn, h1, h2), and k0 has the value ``a`` at the origin and the
+    slope ``b``. The slopes are along the line's value at the origin, and at the other end.
+    """
+    for i in range(t.shape[1]):
+        n = t[0, i]
+        x1 = t[1, i]
+        x2 = t[2, i]
+        r0 = t[3, i] - a * n - b * x1
+        r1 = t[4, i] - a * x1 - b * x2
+        r2 = (t[5, i] - a * t[3, i] - b * t[4, i]) - a * r0 - b * r1
         p = hn + n
         q = h1 + x1
         s = h2 + x2
@@ -126,10 +121,10 @@ def _candidate_costs(
         za = (s * r0 - q * r1) * inverse
         zb = (p * r1 - q * r0) * inverse
         value = r2 - r0 * za - r1 * zb
-        left = -2.0 * (h1 * za + h2 * zb) * per_width
-        out[0, i] = before[i] + (value if value > 0.0 and inverse > 0.0 else 0.0)
-        out[1, i] = -2.0 * (hn * za + h1 * zb) - left
-        out[2, i] = left
+        along = -2.0 * (h1 * za + h2 * zb) * per_width
+        out[0, i] = value if value > 0.0 and inverse > 0.0 else 0.0
+        out[1, i] = -2.0 * (hn * za + h1 * zb) - along
+        out[2, i] = along
 
 
 @inlined
@@ -153,7 +148,7 @@ def least_and_most(row: FloatArray) -> tuple[float, float]:
 
 @kernel
 def fill_leaf_bounds(
-    tree: Tree, prior: FloatArray, before: FloatArray, first: int, last: int, bound: FloatArray
+    tree: Tree, prior: FloatArray, before: FloatArray, bound: FloatArray, first: int, last: int
 ) -> None:
     """Fill ``bound[block, slot]`` of the full blocks in ``[first, last)`` from their candidates.
 
@@ -170,18 +165,14 @@ def fill_leaf_bounds(
             b = bound[block, slot]
             b[0] = -np.inf
             if block + 1 + window <= blocks:
-                _candidate_costs(tree.leaf[block], prior[block, slot], per_width, mine, out)
+                p = prior[block, slot]
+                about_line(tree.leaf[block], p[0], p[1], p[2], p[3], p[4], per_width, out)
+                for i in range(LEAF):
+                    out[0, i] = mine[i] + out[0, i]
                 b[0], _ = least_and_most(out[0])
                 b[1], b[2] = least_and_most(out[1])
                 b[3], b[4] = least_and_most(out[2])
             window = window * BRANCH if slot else 1
-
-
-def make_priors(tree: Tree, limit: float) -> NDArray[np.float64]:
-    """Return the layer-independent part of the bounds, shape (nodes, SLOTS, 5)."""
-    prior = np.zeros((len(tree.node), SLOTS, 5))
-    fill_priors(tree, limit, prior)
-    return prior
 
 
 # Bounds of the larger nodes from those of their children, in a fixed number of steps each.

@@ -16,58 +16,35 @@ from typing import NamedTuple
 import numpy as np
 
 from valveflow_ros.numerics import inlined, kernel
-from valveflow_ros.partition.bounds import SHARE, least_and_most
+from valveflow_ros.partition.bounds import SHARE, about_line, least_and_most
 from valveflow_ros.partition.moments import LEAF, Moments, Tree
 from valveflow_ros.records import FloatArray, IntArray
 
 
 class Group(NamedTuple):
-    """Working memory of one group of ends.
+    """Working memory of one group of ends."""
 
-    Attributes
-    ----------
-    tail : float64 (6, LEAF)
-        Moments of the group's samples up to each end; the origin is the sample before them.
-    best : float64 (LEAF,)
-        Smallest cost found for each end; -inf for an end that is not needed.
-    breaks : int64 (LEAF,)
-        The break of that cost, or -1.
-    excess : float64 (LEAF,)
-        Bound of the tail's cost about the reference line, for each end.
-    line : float64 (8,)
-        Reference line (value at the origin, slope per distance); smallest and
-        largest tangent slope along the value at the origin, and along the value
-        at the last sample; smallest ``excess - best``; width of the tail, < 0.
-    slopes : float64 (2, LEAF)
-    cost : float64 (LEAF,)
-    keep : int64 (LEAF,)
-        Buffers.
-    """
-
+    # (6, LEAF) moments of the samples up to each end; the origin is the sample before them.
     tail: FloatArray
-    best: FloatArray
-    breaks: IntArray
-    excess: FloatArray
+    best: FloatArray  # (LEAF,) smallest cost found for each end; -inf for one that is not needed
+    breaks: IntArray  # (LEAF,) the break of that cost, or -1
+    # (3, LEAF) bound of the tail's cost about the reference line, and its two slopes.
+    about: FloatArray
+    # (8,) reference line (value at the origin, slope per distance); smallest and largest tangent
+    # slope along the value at the origin, and along the value at the last sample; smallest bound
+    # minus `best`; width of the tail, < 0.
     line: FloatArray
-    slopes: FloatArray
-    cost: FloatArray
-    keep: IntArray
+    cost: FloatArray  # (LEAF,) buffer
+    keep: IntArray  # (LEAF,) buffer
 
 
-def _new_group() -> Group:
+@inlined
+def new_group() -> Group:
+    """Return working memory."""
     return Group(
-        np.zeros((6, LEAF)),
-        np.empty(LEAF),
-        np.empty(LEAF, np.int64),
-        np.empty(LEAF),
-        np.zeros(8),
-        np.empty((2, LEAF)),
-        np.empty(LEAF),
-        np.empty(LEAF, np.int64),
-    )
-
-
-new_group = inlined(_new_group)
+        np.zeros((6, LEAF)), np.empty(LEAF), np.empty(LEAF, np.int64), np.empty((3, LEAF)),
+        np.zeros(8), np.empty(LEAF), np.empty(LEAF, np.int64),
+    )  # fmt: skip
 
 
 @kernel
@@ -133,7 +110,7 @@ def try_break(group: Group, m: Moments, cost: float, break_: int, first: int) ->
 @inlined
 def refresh(group: Group) -> None:
     """Update the smallest difference between the tail's bound and the best known cost."""
-    e = group.excess
+    e = group.about[0]
     b = group.best
     low0 = low1 = low2 = low3 = np.inf
     for k in range(0, LEAF, 4):
@@ -160,31 +137,12 @@ def bound_about_line(
         slope = 0.0
     line[0] = value
     line[1] = slope
-    hn = SHARE * core[0]
-    h1 = SHARE * core[1]
-    h2 = SHARE * core[2]
-    per_width = 1.0 / line[7]
-    excess = group.excess
-    begin = group.slopes[0]
-    end = group.slopes[1]
-    for k in range(t.shape[1]):
-        r0 = t[3, k] - value * t[0, k] - slope * t[1, k]
-        r1 = t[4, k] - value * t[1, k] - slope * t[2, k]
-        r2 = (t[5, k] - value * t[3, k] - slope * t[4, k]) - value * r0 - slope * r1
-        p = hn + t[0, k]
-        q = h1 + t[1, k]
-        s = h2 + t[2, k]
-        det = p * s - q * q
-        inverse = 1.0 / det if det > 1e-12 * p * s else 0.0
-        za = (s * r0 - q * r1) * inverse
-        zb = (p * r1 - q * r0) * inverse
-        least = r2 - r0 * za - r1 * zb
-        excess[k] = least if least > 0.0 and inverse > 0.0 else 0.0
-        along = -2.0 * (h1 * za + h2 * zb) * per_width
-        begin[k] = -2.0 * (hn * za + h1 * zb) - along
-        end[k] = along
-    line[2], line[3] = least_and_most(begin)
-    line[4], line[5] = least_and_most(end)
+    out = group.about
+    about_line(
+        t, SHARE * core[0], SHARE * core[1], SHARE * core[2], value, slope, 1.0 / line[7], out
+    )
+    line[2], line[3] = least_and_most(out[1])
+    line[4], line[5] = least_and_most(out[2])
     refresh(group)
 
 
@@ -192,7 +150,7 @@ def bound_about_line(
 def bound_about_best_line(group: Group) -> None:
     """Bound the tail's cost by its own best line, as long as there is no core."""
     t = group.tail
-    excess = group.excess
+    excess = group.about[0]
     for k in range(t.shape[1]):
         each = 1.0 / t[0, k]
         sxx = t[2, k] - t[1, k] * t[1, k] * each
@@ -231,18 +189,13 @@ CELLS = LEAF // CELL
 
 
 class Near(NamedTuple):
-    """Costs of short pieces.
+    """Costs of short pieces."""
 
-    Attributes
-    ----------
-    square : float64 (blocks * CELLS, CELL, CELL)
-        ``square[c, i, k]``: cost of the samples ``i..k`` of cell ``c``; inf for ``k < i``.
-    edge : float64 (blocks, CELL * CELLS * (CELLS - 1) / 2)
-        For the cells 1, 2, ... of a block in turn: the cost from each earlier
-        sample of the block up to the cell's begin.
-    """
-
+    # (blocks * CELLS, CELL, CELL): [c, i, k] is the cost of the samples i..k of cell c; inf for
+    # k < i.
     square: FloatArray
+    # (blocks, CELL * CELLS * (CELLS - 1) / 2), for the cells 1, 2, ... of a block in turn: the
+    # cost from each earlier sample of the block up to the cell's begin.
     edge: FloatArray
 
 
@@ -311,8 +264,7 @@ def fill_near(tree: Tree, first: int, last: int, near: Near) -> None:
 def make_near(blocks: int) -> Near:
     """Return empty tables; `fill_near` fills them."""
     return Near(
-        np.empty((blocks * CELLS, CELL, CELL)),
-        np.empty((blocks, CELL * CELLS * (CELLS - 1) // 2)),
+        np.empty((blocks * CELLS, CELL, CELL)), np.empty((blocks, CELL * CELLS * (CELLS - 1) // 2))
     )
 
 
@@ -334,16 +286,9 @@ def _adopt_row(
 
 @kernel
 def _search_edge(
-    tree: Tree,
-    edge: FloatArray,
-    before: FloatArray,
-    first: int,
-    at: int,
-    shortest: int,
-    room: float,
-    best: FloatArray,
-    breaks: IntArray,
-) -> None:
+    tree: Tree, edge: FloatArray, before: FloatArray, first: int, at: int, shortest: int,
+    room: float, best: FloatArray, breaks: IntArray,
+) -> None:  # fmt: skip
     """Try the breaks ``[first, at)`` for the ends of the cell that begins at ``at``."""
     possible = 0
     for i in range(edge.shape[0]):
@@ -361,23 +306,13 @@ def _search_edge(
 
 @kernel
 def search_near(
-    tree: Tree,
-    near: Near,
-    before: FloatArray,
-    block: int,
-    shortest: int,
-    slack: float,
-    best: FloatArray,
-    breaks: IntArray,
-) -> None:
+    tree: Tree, near: Near, before: FloatArray, block: int, shortest: int, slack: float,
+    best: FloatArray, breaks: IntArray,
+) -> None:  # fmt: skip
     """Try all breaks inside a block for all ends inside it.
 
-    Parameters
-    ----------
-    before : float64 (ends,)
-        Cost of the best pieces up to each end, one piece fewer.
-    best, breaks : (LEAF,)
-        Best cost and break known for the ends ``LEAF * block + 1 ...``; improved in place.
+    ``before`` (ends,) is the cost of the best pieces up to each end, one piece fewer. ``best`` and
+    ``breaks`` (LEAF,) of the ends ``LEAF * block + 1 ...`` are improved in place.
     """
     first = LEAF * block
     filled = 0

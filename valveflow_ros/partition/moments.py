@@ -35,33 +35,18 @@ Moments = tuple[float, float, float, float, float, float]
 
 
 class Tree(NamedTuple):
-    """Sorted samples, padded with weight 0 to whole blocks, and their moments.
+    """Sorted samples, padded with weight 0 to whole blocks, and their moments."""
 
-    Attributes
-    ----------
-    n : int
-        Number of samples (distinct openings) before padding.
-    levels : int
-        Number of levels of nodes; a node of level ``k`` contains ``BRANCH**k`` full blocks.
-    x, y, w : float64 (blocks * LEAF,)
-        Position, value and weight.
-    leaf : float64 (blocks, 6, LEAF)
-        ``leaf[b, :, i]``: moments from sample ``i`` of block ``b`` to its end,
-        origin at the block's last sample.
-    start : int64 (levels + 1,)
-        Number of the first node of each level in `node`, and the number of all nodes.
-    node : float64 (nodes, 7)
-        Moments of a whole node, origin at its last sample; then that origin.
-    """
-
-    n: int
-    levels: int
-    x: FloatArray
+    n: int  # samples (distinct openings) before padding
+    levels: int  # of nodes; a node of level k contains BRANCH**k full blocks
+    x: FloatArray  # (blocks * LEAF,) position, value and weight
     y: FloatArray
     w: FloatArray
+    # (blocks, 6, LEAF): [b, :, i] are the moments from sample i of block b to its end, origin at
+    # the block's last sample.
     leaf: FloatArray
-    start: IntArray
-    node: FloatArray
+    start: IntArray  # (levels + 1,) number of the first node of each level, and of all nodes
+    node: FloatArray  # (nodes, 7) moments of a whole node, origin at its last sample; that origin
 
 
 @inlined
@@ -171,15 +156,8 @@ def _fill_nodes(x: FloatArray, leaf: FloatArray, start: IntArray, node: FloatArr
 
 
 def build_tree(x: FloatArray, y: FloatArray, w: FloatArray) -> Tree:
-    """Build the tree over samples sorted by strictly increasing position.
+    """Build the tree over samples (n,) sorted by strictly increasing x, with weights > 0.
 
-    Parameters
-    ----------
-    x, y, w : float64 (n,)
-        Positions, values and weights > 0.
-
-    Notes
-    -----
     O(n) time; about 75 bytes per sample.
     """
     n = len(x)

@@ -27,46 +27,22 @@ _EXACT = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """A chosen number of pieces and why.
+    """A chosen number of pieces and why."""
 
-    Attributes
-    ----------
-    pieces : int
-        The chosen J.
-    turning_angle : dict
-        Lambda(J) of eq. (24), which is defined for J = 2 .. J_max - 1.
-    cost : dict
-        Omega(J) of eq. (19) in MW^2, J = 1 .. J_max.
-    note : str
-        Why the rule was not followed, as a sentence; empty if it was.
-    """
-
-    pieces: int
-    turning_angle: dict[int, float]
-    cost: dict[int, float]
-    note: str
+    pieces: int  # the chosen J
+    turning_angle: dict[int, float]  # Lambda(J) of eq. (24), defined for J = 2 .. J_max - 1
+    cost: dict[int, float]  # Omega(J) of eq. (19) in MW^2, J = 1 .. J_max
+    note: str  # why the rule was not followed, as a sentence; empty if it was
 
 
 def paper_rule(
     cost: Sequence[float] | FloatArray, exact: float = 0.0
 ) -> tuple[dict[int, float], int]:
-    """Return Lambda(J) of eq. (24) for J = 2 .. J_max - 1, and the J of its maximum.
+    """Return Lambda(J) of eq. (24) for J = 2 .. J_max - 1, and the smallest J of its maximum.
 
-    Parameters
-    ----------
-    cost : sequence of float (J_max,)
-        Omega(1), Omega(2), ...; finite and >= 0, at least three.
-    exact : float
-        Costs up to this value are taken as zero.
-
-    Returns
-    -------
-    turning_angle : dict
-        Lambda(J) in [-1, 1].
-    pieces : int
-        The smallest J with the largest Lambda. Never 1 and never J_max: the rule
-        compares the decrease of log Omega from J - 1 to J with that from J to
-        J + 1, and one of them does not exist at these ends.
+    The costs are Omega(1), Omega(2), ...; those up to ``exact`` are taken as zero. J is never 1
+    and never J_max: the rule compares the decrease of log Omega from J - 1 to J with that from J
+    to J + 1, and one of them does not exist at these ends.
 
     Raises
     ------
@@ -110,12 +86,8 @@ def _turn(into: float, out: float) -> float:
 def select(partition: Partition, correlation_inflation: float = 1.0) -> Selection:
     """Choose J by eq. (24).
 
-    Parameters
-    ----------
-    partition : Partition
-    correlation_inflation : float
-        Ratio of the variance of a long mean of the residual to that of independent
-        samples, at least 1.
+    ``correlation_inflation`` is the ratio of the variance of a long mean of the residual to that
+    of independent samples, at least 1.
 
     Raises
     ------

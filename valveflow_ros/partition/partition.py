@@ -24,9 +24,6 @@ from valveflow_ros.numerics import cores, kernel
 from valveflow_ros.partition.search import best_partitions, prepare
 from valveflow_ros.records import FloatArray, IntArray
 
-# Preparation of the samples for the search: check, sort, merge equal u, scale.
-
-
 # Values of u closer than this fraction of the range are merged: no plant resolves them.
 _SAME_U = 1e-9
 # For larger values, or a range below the inverse, sums of squares overflow or underflow.
@@ -36,42 +33,22 @@ _HEAVIEST = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Sorted samples, and the weighted levels of u that they form.
+    """Sorted samples, and the weighted levels of u that they form."""
 
-    Attributes
-    ----------
-    u, y, each : float64 (n,)
-        The samples in ascending order of u, of y within equal u, and their weights; read-only.
-    first : int64 (levels + 1,)
-        The first sample of each level, and n.
-    x : float64 (levels,)
-        The u of each level times a power of two that makes the range about 1, which
-        changes no digit; where `rough`, the mean distance from the first sample, so scaled.
-    residual : float64 (levels,)
-        Mean y of each level about one line through all, over `scale`.
-    weight : float64 (levels,)
-        Sum of the samples' weights.
-    scale : float
-        Root mean square of the levels' residual in the unit of y, or 1 if this is 0.
-    within : float
-        Sum of squares inside levels, which is the same for all partitions.
-    rough : bool
-        True if some levels contain u that are not exactly equal.
-    floor : float
-        Costs up to this value are rounding of u and y, in the square of the unit of y.
-    """
-
+    # (n,) the samples in ascending order of u, of y within equal u, and their weights; read-only.
     u: FloatArray
     y: FloatArray
     each: FloatArray
-    first: IntArray
+    first: IntArray  # (levels + 1,) the first sample of each level, and n
+    # (levels,) the u of each level times a power of two that makes the range about 1, which
+    # changes no digit; where `rough`, the mean distance from the first sample, so scaled.
     x: FloatArray
-    residual: FloatArray
-    weight: FloatArray
-    scale: float
-    within: float
-    rough: bool
-    floor: float
+    residual: FloatArray  # (levels,) mean y about one line through all, over `scale`
+    weight: FloatArray  # (levels,) sum of the samples' weights
+    scale: float  # root mean square of the levels' residual in the unit of y, or 1 if this is 0
+    within: float  # sum of squares inside levels, which is the same for all partitions
+    rough: bool  # some levels contain u that are not exactly equal
+    floor: float  # costs up to this are rounding of u and y, in the square of the unit of y
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -81,22 +58,15 @@ class Levels:
 def make_levels(u: ArrayLike, y: ArrayLike, weight: ArrayLike | None = None) -> Levels:
     """Check, sort, merge and scale samples; without ``weight`` each has weight 1.
 
-    Raises
-    ------
-    DataError
-        The lengths differ, a value is not a finite number below 1e100, u is constant,
-        or a weight is not between 1e-6 and 1e6.
-    TooFewSamplesError
-        There are fewer than two samples.
+    Raises `DataError` and `TooFewSamplesError` as `partition` does.
     """
-    grain = max(_grain(u), _grain(y))
     a, b = _numbers('u', u), _numbers('y', y)
     if a.ndim != 1 or a.shape != b.shape:
         raise DataError(
             f'u and y must be one-dimensional and equally long, not {a.shape} and {b.shape}.'
         )
     for name, values in (('u', a), ('y', b)):
-        _check_values(name, values)
+        _check(name, values)
     each = np.ones(len(a)) if weight is None else _weights(weight, a.shape)
     if len(a) < 2:
         raise TooFewSamplesError('Samples', len(a), 2)
@@ -106,7 +76,7 @@ def make_levels(u: ArrayLike, y: ArrayLike, weight: ArrayLike | None = None) -> 
     a, b, each = a[order], b[order], each[order]
     for values in (a, b, each):
         values.flags.writeable = False
-    return _merged(a, b, each, grain)
+    return _merged(a, b, each, max(_grain(u), _grain(y)))
 
 
 def _weights(weight: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
@@ -124,7 +94,6 @@ def _weights(weight: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _numbers(name: str, values: ArrayLike) -> FloatArray:
-    """Convert an array-like to float64; raise `DataError` if this is impossible."""
     array = np.asarray(values)
     if array.dtype.kind not in 'biuf':
         raise DataError(f'{name} must hold real numbers, not {array.dtype}.')
@@ -139,7 +108,7 @@ def _grain(values: ArrayLike) -> float:
     return max(finest, float(np.finfo(dtype).eps)) if dtype.kind == 'f' else finest
 
 
-def _check_values(name: str, values: FloatArray) -> None:
+def _check(name: str, values: FloatArray) -> None:
     """Raise `DataError` for NaN, infinity and too large values, naming the first of them."""
     bad = np.flatnonzero(~(np.abs(values) <= _LARGEST))
     if len(bad) == 0:
@@ -165,7 +134,6 @@ def _level_starts(u: FloatArray, tolerance: float, first: IntArray) -> int:
 
 
 def _merged(u: FloatArray, y: FloatArray, each: FloatArray, grain: float) -> Levels:
-    """Merge sorted samples into levels."""
     n = len(u)
     span = float(u[-1] - u[0])
     first = np.empty(n + 1, dtype=np.int64)
@@ -189,18 +157,11 @@ def _merged(u: FloatArray, y: FloatArray, each: FloatArray, grain: float) -> Lev
     scale = math.sqrt(float((weight * residual * residual).sum()) / total) or 1.0
     inside = dy - np.repeat(mean, size)
     return Levels(
-        u=u,
-        y=y,
-        each=each,
-        first=first,
-        x=np.ldexp(x, -math.frexp(span)[1]),
-        residual=residual / scale,
-        weight=weight,
-        scale=scale,
-        within=float((each * inside * inside).sum()),
-        rough=rough,
+        u=u, y=y, each=each, first=first, x=np.ldexp(x, -math.frexp(span)[1]),
+        residual=residual / scale, weight=weight, scale=scale,
+        within=float((each * inside * inside).sum()), rough=rough,
         floor=total * (4.0 * grain * (np.abs(y).max() + abs(slope) * np.abs(u).max())) ** 2,
-    )
+    )  # fmt: skip
 
 
 # A bound is taken as reached within this fraction of the sum of squares about one line. It is
@@ -218,30 +179,17 @@ _SERIAL_BELOW = 20_000
 class FittedPiece:
     """One piece of a partition, fitted by least squares, eq. (20).
 
-    Attributes
-    ----------
-    u_from, u_to : float
-        The piece's range in % MPa^m. A piece begins at its first sample, as in the
-        paper, and ends where the next one begins, so there are no gaps.
-    slope : float
-        K_f in MW per unit of u.
-    intercept : float
-        C in MW.
-    samples : int
-    sse : float
-        Sum of squared residuals in MW^2.
-    slope_stderr, intercept_stderr : float
-        Standard errors for independent samples; NaN for two samples, which have no
-        residual.
+    A piece begins at its first sample, as in the paper, and ends where the next one begins, so
+    there are no gaps.
     """
 
-    u_from: float
+    u_from: float  # % MPa^m
     u_to: float
-    slope: float
-    intercept: float
+    slope: float  # K_f in MW per unit of u
+    intercept: float  # C in MW
     samples: int
-    sse: float
-    slope_stderr: float
+    sse: float  # sum of squared residuals in MW^2
+    slope_stderr: float  # for independent samples; NaN for two, which have no residual
     intercept_stderr: float
 
 
@@ -249,35 +197,21 @@ class FittedPiece:
 class Partition:
     """The best partitions into 1, 2, ... J_max pieces.
 
-    Attributes
-    ----------
-    cost : float64 (J_max,)
-        Omega(J) of eq. (19) in MW^2, recomputed in two passes from the samples.
-        Due to the minimum size of pieces it can rise with J.
-    u, y, weight : float64 (n,)
-        The samples in ascending order of u, and their weights; read-only.
-    starts : tuple of int64 arrays
-        For each J the index of the first sample of each piece, and n.
-    n_distinct : int
-        Number of different u.
-    certified : bool
-        True if the search's own costs agree with `cost`. As the lower bounds are exact, no
-        partition then costs less than ``cost[J - 1] - tolerance``.
-    floor : float
-        Costs up to this value, in MW^2, are rounding of the samples.
-    limited : str
-        Why there are fewer partitions than requested, as a sentence; else empty.
+    If it is ``certified``, the search's own costs agree with `cost`. As the lower bounds are
+    exact, no partition then costs less than ``cost[J - 1] - tolerance``.
     """
 
+    # (J_max,) Omega(J) of eq. (19) in MW^2, recomputed in two passes from the samples. Due to the
+    # minimum size of pieces it can rise with J.
     cost: FloatArray
-    u: FloatArray
+    u: FloatArray  # (n,) the samples in ascending order of u, and their weights; read-only
     y: FloatArray
     weight: FloatArray
-    starts: tuple[IntArray, ...]
-    n_distinct: int
+    starts: tuple[IntArray, ...]  # for each J the first sample of each piece, and n
+    n_distinct: int  # number of different u
     certified: bool
-    floor: float
-    limited: str
+    floor: float  # costs up to this value, in MW^2, are rounding of the samples
+    limited: str  # why there are fewer partitions than requested, as a sentence; else empty
 
     @property
     def n_samples(self) -> int:
@@ -308,14 +242,9 @@ class Partition:
 
 
 def partition(
-    u: ArrayLike,
-    y: ArrayLike,
-    max_pieces: int = 10,
-    min_distinct: int = 2,
-    *,
-    weight: ArrayLike | None = None,
-    threads: int | None = None,
-) -> Partition:
+    u: ArrayLike, y: ArrayLike, max_pieces: int = 10, min_distinct: int = 2, *,
+    weight: ArrayLike | None = None, threads: int | None = None,
+) -> Partition:  # fmt: skip
     """Partition samples exactly into 1, 2, ... ``max_pieces`` straight pieces.
 
     Parameters
@@ -336,8 +265,8 @@ def partition(
     Raises
     ------
     DataError
-        The lengths differ, a value is not a finite number or no valid weight, or u is
-        constant.
+        The lengths differ, a value is not a finite number below 1e100, u is constant, or a
+        weight is not between 1e-6 and 1e6.
     TooFewSamplesError
         There are too few distinct u for one piece.
     ParameterError
@@ -356,9 +285,14 @@ def partition(
     Time grows slightly faster than n for each J in practice, O(J n^2) at worst; memory
     is about 300 bytes per sample for 10 pieces.
     """
-    _at_least('max_pieces', max_pieces, 1)
-    _at_least('min_distinct', min_distinct, 2)
-    _at_least('threads', 1 if threads is None else threads, 1)
+    given = (
+        ('max_pieces', max_pieces, 1),
+        ('min_distinct', min_distinct, 2),
+        ('threads', threads, 1),
+    )
+    for name, value, least in given:
+        if value is not None and not value >= least:
+            raise ParameterError(name, f'is {value}, but must be at least {least}')
     levels = make_levels(u, y, weight)
     if len(levels) < min_distinct:
         raise TooFewSamplesError('Distinct values of u for one piece', len(levels), min_distinct)
@@ -370,17 +304,15 @@ def partition(
     found, starts = best_partitions(problem, most)
     original = tuple(levels.first[s] for s in starts)
     cost = np.array([_cost(levels.u, levels.y, levels.each, s) for s in original])
+    limited = '' if most == max_pieces else (
+        f'{max_pieces} pieces of {min_distinct} distinct u each were asked for, but there are '
+        f'only {len(levels)} distinct u: {most} is the largest number of pieces.'
+    )  # fmt: skip
     return Partition(
-        cost=cost,
-        u=levels.u,
-        y=levels.y,
-        weight=levels.each,
-        starts=original,
-        n_distinct=len(levels),
-        certified=_agree(levels, found, cost, starts),
-        floor=levels.floor,
-        limited=_limit(len(levels), most, max_pieces, min_distinct),
-    )
+        cost=cost, u=levels.u, y=levels.y, weight=levels.each, starts=original,
+        n_distinct=len(levels), certified=_agree(levels, found, cost, starts),
+        floor=levels.floor, limited=limited,
+    )  # fmt: skip
 
 
 def _agree(levels: Levels, found: FloatArray, cost: FloatArray, starts: list[IntArray]) -> bool:
@@ -391,20 +323,6 @@ def _agree(levels: Levels, found: FloatArray, cost: FloatArray, starts: list[Int
         cost = np.array([_cost(flat, levels.y, levels.each, levels.first[s]) for s in starts])
     claimed = found * levels.scale**2 + levels.within
     return bool(np.all(np.abs(claimed - cost) <= _AGREE * cost[0] + levels.floor))
-
-
-def _at_least(name: str, value: int, least: int) -> None:
-    if not value >= least:
-        raise ParameterError(name, f'is {value}, but must be at least {least}')
-
-
-def _limit(distinct: int, most: int, asked: int, least: int) -> str:
-    if most == asked:
-        return ''
-    return (
-        f'{asked} pieces of {least} distinct u each were asked for, but there are only '
-        f'{distinct} distinct u: {most} is the largest number of pieces.'
-    )
 
 
 def _centred(
@@ -425,26 +343,18 @@ def _centred(
 
 
 def _cost(u: FloatArray, y: FloatArray, weight: FloatArray, starts: IntArray) -> float:
-    """Return the cost of a partition from the samples themselves."""
     return sum(_centred(u[a:b], y[a:b], weight[a:b])[4] for a, b in itertools.pairwise(starts))
 
 
 def _fit_piece(
     u: FloatArray, y: FloatArray, weight: FloatArray, begin: float, end: float
 ) -> FittedPiece:
-    """Fit one piece."""
     mean_u, mean_y, slope, spread, sse = _centred(u, y, weight)
     n = len(u)
     variance = sse / (n - 2) if n > 2 else math.nan
+    leverage = 1.0 / float(weight.sum()) + mean_u * mean_u / spread
     return FittedPiece(
-        u_from=begin,
-        u_to=end,
-        slope=slope,
-        intercept=mean_y - slope * mean_u,
-        samples=n,
-        sse=sse,
+        u_from=begin, u_to=end, slope=slope, intercept=mean_y - slope * mean_u, samples=n, sse=sse,
         slope_stderr=math.sqrt(variance / spread),
-        intercept_stderr=math.sqrt(
-            variance * (1.0 / float(weight.sum()) + mean_u * mean_u / spread)
-        ),
-    )
+        intercept_stderr=math.sqrt(variance * leverage),
+    )  # fmt: skip

@@ -16,14 +16,15 @@ group, are updated by additions only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from valveflow_ros.numerics import inlined, kernel, run_in_threads, runs
-from valveflow_ros.partition.bounds import SLOTS, fill_leaf_bounds, fill_node_bounds, make_priors
+from valveflow_ros.partition.bounds import SLOTS, fill_leaf_bounds, fill_node_bounds, fill_priors
 from valveflow_ros.partition.group import (
     Group,
     Near,
@@ -61,31 +62,17 @@ _RENEW = 4.0
 class Layer(NamedTuple):
     """The inputs of the search of one layer, besides the tree.
 
-    Attributes
-    ----------
-    pieces : int
-        Number of pieces of this layer.
-    shortest : int
-        Smallest number of samples in a piece.
-    slack : float
-        A bound is taken as reached within ``slack`` >= 0.
-    limit : float
-        Reference lines stay within ``[-limit, limit]``.
-    near : Near
-    prior : float64 (nodes, SLOTS, 5)
-    before : float64 (ends,)
-        Costs of the previous layer, indexed by end.
-    bound : float64 (nodes, SLOTS, 5)
+    A bound is taken as reached within ``slack`` >= 0; reference lines stay within +- ``limit``.
     """
 
     pieces: int
-    shortest: int
+    shortest: int  # smallest number of samples in a piece
     slack: float
     limit: float
     near: Near
-    prior: FloatArray
-    before: FloatArray
-    bound: FloatArray
+    prior: FloatArray  # (nodes, SLOTS, 5)
+    before: FloatArray  # (ends,) costs of the previous layer
+    bound: FloatArray  # (nodes, SLOTS, 5)
 
 
 @inlined
@@ -241,26 +228,13 @@ def _collect_breaks(group: Group, seeds: IntArray) -> int:
 
 @kernel
 def search_groups(
-    tree: Tree,
-    layer: Layer,
-    first: int,
-    last: int,
-    after: FloatArray,
-    breaks: NDArray[np.int32],
+    tree: Tree, layer: Layer, after: FloatArray, breaks: NDArray[np.int32], first: int, last: int
 ) -> int:
-    """Fill ``after`` and ``breaks`` for the ends of the groups ``[first, last)``.
+    """Fill ``after`` and ``breaks`` (ends,) for the ends of the groups ``[first, last)``.
 
-    Parameters
-    ----------
-    after : float64 (ends,)
-        Cost of the best ``layer.pieces`` pieces up to each end; inf if impossible.
-    breaks : int32 (ends,)
-        First sample of the last piece; -1 if impossible.
-
-    Returns
-    -------
-    int
-        Number of leaves opened, which the bounds could not exclude.
+    They are the cost of the best ``layer.pieces`` pieces up to each end, inf if impossible, and
+    the first sample of the last piece, then -1. Return the number of leaves that the bounds could
+    not exclude.
     """
     group = new_group()
     seeds = np.empty(_FIRST_SEEDS + LEAF, np.int64)
@@ -289,9 +263,6 @@ def search_groups(
     return leaves
 
 
-# All layers of the exact dynamic programme, and the backtracking.
-
-
 # Groups in one task of a thread. The number is fixed, so that the result does
 # not depend on the number of threads.
 _RUN = 64
@@ -312,32 +283,22 @@ class Problem(NamedTuple):
 def prepare(
     x: FloatArray, y: FloatArray, w: FloatArray, shortest: int, slack: float, threads: int
 ) -> Problem:
-    """Build the tables for `layers`.
+    """Build the tables for `layers`, of x strictly increasing and w > 0, all (n,).
 
-    Parameters
-    ----------
-    x, y, w : float64 (n,)
-        Strictly increasing positions, values, weights > 0.
-    shortest : int
-        Smallest number of samples in a piece, >= 2.
-    slack : float
-        Each layer's cost may exceed the optimum by this much, >= 0.
-    threads : int
-        Threads to use; 1 starts none.
+    A piece has at least ``shortest`` >= 2 samples, each layer's cost may exceed the optimum by
+    ``slack`` >= 0, and with ``threads`` of 1 none is started.
     """
     tree = build_tree(x, y, w)
     near = make_near(len(tree.leaf))
-
-    def fill(first: int, last: int) -> None:
-        fill_near(tree, first, last, near)
-
-    run_in_threads(fill, runs(len(tree.leaf), _RUN), threads)
+    run_in_threads(lambda a, b: fill_near(tree, a, b, near), runs(len(tree.leaf), _RUN), threads)
     limit = 2.0 * float(np.abs(y).max())
-    return Problem(tree, near, make_priors(tree, limit), shortest, slack, limit, threads)
+    prior = np.zeros((len(tree.node), SLOTS, 5))
+    fill_priors(tree, limit, prior)
+    return Problem(tree, near, prior, shortest, slack, limit, threads)
 
 
 @kernel
-def _fill_first(tree: Tree, shortest: int, first: int, last: int, after: FloatArray) -> None:
+def _fill_first(tree: Tree, shortest: int, after: FloatArray, first: int, last: int) -> None:
     """Fill the costs of one piece that begins at the first sample, for a run of groups."""
     for block in range(first, last):
         n = x1 = x2 = y1 = xy = yy = 0.0
@@ -374,14 +335,15 @@ def layers(problem: Problem, pieces: int) -> Iterator[tuple[FloatArray, NDArray[
     blocks = len(tree.leaf)
     before = np.full(LEAF * blocks + 1, np.inf)
     after = np.full(LEAF * blocks + 1, np.inf)
-    run_in_threads(_first(problem, after), runs(blocks, _RUN), threads)
+    groups = runs(blocks, _RUN)
+    run_in_threads(partial(_fill_first, tree, problem.shortest, after), groups, threads)
     yield after, np.zeros(len(after), dtype=np.int32)
     bound = np.empty_like(problem.prior)
-    groups = runs(blocks, _RUN)
     for j in range(2, pieces + 1):
         before, after = after, before
         after[0] = np.inf
-        run_in_threads(_leaf_bounds(problem, before, bound), runs(blocks, _RUN), threads)
+        fill = partial(fill_leaf_bounds, tree, problem.prior, before, bound)
+        run_in_threads(fill, runs(blocks, _RUN), threads)
         for level in range(1, tree.levels):
             count = int(tree.start[level + 1] - tree.start[level])
             fill_node_bounds(tree, problem.prior, level, 0, count, bound)
@@ -392,39 +354,15 @@ def layers(problem: Problem, pieces: int) -> Iterator[tuple[FloatArray, NDArray[
         breaks: NDArray[np.int32] = np.full(len(after), -1, dtype=np.int32)
         if j == pieces:
             groups = [((tree.n - 1) // LEAF, (tree.n - 1) // LEAF + 1)]
-        run_in_threads(_groups(tree, layer, after, breaks), groups, threads)
+        run_in_threads(partial(search_groups, tree, layer, after, breaks), groups, threads)
         yield after, breaks
 
 
-def _first(problem: Problem, after: FloatArray) -> Callable[[int, int], None]:
-    return lambda a, b: _fill_first(problem.tree, problem.shortest, a, b, after)
-
-
-def _leaf_bounds(
-    problem: Problem, before: FloatArray, bound: FloatArray
-) -> Callable[[int, int], None]:
-    return lambda a, b: fill_leaf_bounds(problem.tree, problem.prior, before, a, b, bound)
-
-
-def _groups(
-    tree: Tree, layer: Layer, after: FloatArray, breaks: NDArray[np.int32]
-) -> Callable[[int, int], int]:
-    return lambda a, b: search_groups(tree, layer, a, b, after, breaks)
-
-
 def best_partitions(problem: Problem, pieces: int) -> tuple[FloatArray, list[IntArray]]:
-    """Solve eqs. (21)-(23) of the paper for 1..``pieces`` pieces.
+    """Solve eqs. (21)-(23) of the paper for 1..``pieces`` pieces, ``pieces * shortest <= n``.
 
-    Parameters
-    ----------
-    pieces : int
-        With ``pieces * shortest <= n``.
-
-    Returns
-    -------
-    cost : float64 (pieces,)
-    starts : list of int64 arrays
-        ``starts[j - 1]`` contains 0, the first samples of the other pieces, and n.
+    Return the costs (pieces,) and ``starts``: ``starts[j - 1]`` contains 0, the first samples of
+    the other pieces, and n.
     """
     n = problem.tree.n
     cost = np.empty(pieces)

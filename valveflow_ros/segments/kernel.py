@@ -9,22 +9,20 @@ of the paper, and are ignored. From then on a line is also fitted to the power,
 and a deviation from it is a break, too. The blocks between the end of the
 transient and the next break are classified by `judge`.
 
-All state lives in three arrays, so that it can be copied, saved and compared.
+All state lives in arrays, so that it can be copied, saved and compared.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from valveflow_ros.numerics import jit
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
-# Recursive fit of a straight line to points, in constant time per point.
-
-
-# A line is five running sums over (k, v), k = 0, 1, 2, ... and v taken
+# A line fitted recursively is five running sums over (k, v), k = 0, 1, 2, ... and v taken
 # relative to the first point, so that a large offset causes no loss of digits.
 N, ORIGIN, SV, SKV, SVV = range(5)
 LINE_SIZE = 5
@@ -132,19 +130,8 @@ def noise_level(histogram: FloatArray) -> float:
 
 
 # Integer state.
-(
-    ROW,
-    ROWS_IN_BLOCK,
-    BLOCKS,
-    FIRST_ROW,
-    SKIP,
-    RUN_U,
-    RUN_Y,
-    STRETCHES,
-    IN_STRETCH,
-    LAST_NS,
-    END_NS,
-) = range(11)
+(ROW, ROWS_IN_BLOCK, BLOCKS, FIRST_ROW, SKIP, RUN_U, RUN_Y, STRETCHES, IN_STRETCH, LAST_NS,
+ END_NS) = range(11)  # fmt: skip
 INT_STATE = 11
 
 # The current block: sums of u, power, temperature, and the number of temperatures.
@@ -159,21 +146,8 @@ LINES = 5
 BLOCK_U, BLOCK_Y, BLOCK_T = range(3)
 
 # Settings in the form of the kernel.
-(
-    BLOCK_ROWS,
-    SETTLE,
-    LONGEST,
-    STEADY_MIN,
-    SLOPE_MIN,
-    TRIM,
-    BREAK,
-    STEADY,
-    SLOPE,
-    NOISE_U,
-    NOISE_Y,
-    PERIOD_NS,
-) = range(12)
-SETTINGS_SIZE = 12
+(BLOCK_ROWS, SETTLE, LONGEST, STEADY_MIN, SLOPE_MIN, TRIM, BREAK, STEADY, SLOPE, NOISE_U, NOISE_Y,
+ PERIOD_NS) = range(12)  # fmt: skip
 
 _BEHIND = 6  # blocks whose mean is compared with the line before them
 _BEHIND_LIMIT = 2.5  # in sd of that mean, with half the blocks taken as independent
@@ -181,22 +155,24 @@ _LEAST = 6  # minimum number of blocks of a line
 _ROUGH = 2.0  # a segment with a larger rms residual, in noise sd, is no straight line
 
 # Values that describe a finished segment.
-(
-    SEG_FIRST,
-    SEG_END,
-    SEG_KIND,
-    SEG_U_MEAN,
-    SEG_U_SLOPE,
-    SEG_U_RMS,
-    SEG_Y_MEAN,
-    SEG_Y_SLOPE,
-    SEG_Y_RMS,
-    SEG_T,
-) = range(10)
+(SEG_FIRST, SEG_END, SEG_KIND, SEG_U_MEAN, SEG_U_SLOPE, SEG_U_RMS, SEG_Y_MEAN, SEG_Y_SLOPE,
+ SEG_Y_RMS, SEG_T) = range(10)  # fmt: skip
 SEG_SIZE = 10
 
 # Kind of a row, as far as known when it arrives.
 TRANSIENT, SETTLED_STEADY, SETTLED_SLOPE, NO_DATA = range(4)
+
+
+class Arrays(NamedTuple):
+    """The arrays of one segmentation: state, settings and the last segment found."""
+
+    state: IntArray  # (INT_STATE,)
+    sums: FloatArray  # (SUMS,)
+    lines: FloatArray  # (LINES, LINE_SIZE)
+    blocks: FloatArray  # (3, room)
+    histograms: FloatArray  # (2, BINS)
+    setting: FloatArray  # (12,)
+    found: FloatArray  # (SEG_SIZE,)
 
 
 @jit
@@ -209,14 +185,15 @@ def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float
 
 
 @jit
-def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float, y: float) -> None:
+def _learn(a: Arrays, u: float, y: float) -> None:
     """Add one block to the current noise stretch and close it when it is long enough."""
+    state, lines = a.state, a.lines
     line_add(lines[STRETCH_U], u)
     line_add(lines[STRETCH_Y], y)
     state[IN_STRETCH] += 1
     if state[IN_STRETCH] == WINDOW:
-        noise_add(histograms[0], line_fit(lines[STRETCH_U])[2])
-        noise_add(histograms[1], line_fit(lines[STRETCH_Y])[2])
+        noise_add(a.histograms[0], line_fit(lines[STRETCH_U])[2])
+        noise_add(a.histograms[1], line_fit(lines[STRETCH_Y])[2])
         state[STRETCHES] += 1
         state[IN_STRETCH] = 0
         line_reset(lines[STRETCH_U])
@@ -224,11 +201,12 @@ def _learn(state: IntArray, lines: FloatArray, histograms: FloatArray, u: float,
 
 
 @jit
-def _begin(state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, skip: int) -> None:
+def _begin(a: Arrays, drop: int, skip: int) -> None:
     """Begin a segment ``drop`` blocks after the old one's first, keeping the later blocks.
 
     The first ``skip`` blocks are ignored: they are transient, or were used before.
     """
+    state, lines, blocks = a.state, a.lines, a.blocks
     keep = state[BLOCKS] - drop
     for k in range(keep):
         for row in range(3):
@@ -240,12 +218,13 @@ def _begin(state: IntArray, lines: FloatArray, blocks: FloatArray, drop: int, sk
     for row in range(3):
         line_reset(lines[row])
     for _ in range(keep):
-        _grow(state, lines, blocks)
+        _grow(a)
 
 
 @jit
-def _grow(state: IntArray, lines: FloatArray, blocks: FloatArray) -> None:
+def _grow(a: Arrays) -> None:
     """Add the block at the end of ``blocks`` to the lines."""
+    state, lines, blocks = a.state, a.lines, a.blocks
     k = state[BLOCKS]
     line_add(lines[LINE_U], blocks[BLOCK_U, k])
     if k >= _BEHIND:
@@ -288,16 +267,9 @@ def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool
 
 
 @jit
-def judge(
-    blocks: FloatArray,
-    first: int,
-    end: int,
-    noise_u: float,
-    noise_y: float,
-    setting: FloatArray,
-    found: FloatArray,
-) -> int:
+def _judge(a: Arrays, first: int, end: int, noise_u: float, noise_y: float) -> int:
     """Classify the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
+    blocks, setting, found = a.blocks, a.setting, a.found
     line = np.zeros((2, LINE_SIZE))
     temperature, known = 0.0, 0
     for k in range(first, end):
@@ -324,21 +296,15 @@ def judge(
 
 
 @jit
-def _close(
-    state: IntArray,
-    blocks: FloatArray,
-    end: int,
-    noise_u: float,
-    noise_y: float,
-    setting: FloatArray,
-    found: FloatArray,
-) -> bool:
+def _close(a: Arrays, end: int) -> bool:
     """Classify the open segment up to block ``end``; True if it is a special segment."""
+    state, setting, found = a.state, a.setting, a.found
     first = state[SKIP]
     least = min(setting[STEADY_MIN], setting[SLOPE_MIN])
     if end - first < max(least, 3):
         return False
-    kind = judge(blocks, first, end, noise_u, noise_y, setting, found)
+    noise_u, noise_y = noise_now(a.histograms, setting)
+    kind = _judge(a, first, end, noise_u, noise_y)
     if kind == 0:
         return False
     rows = int(setting[BLOCK_ROWS])
@@ -352,25 +318,18 @@ def _close(
 
 
 @jit
-def _take_block(
-    state: IntArray,
-    lines: FloatArray,
-    blocks: FloatArray,
-    histograms: FloatArray,
-    setting: FloatArray,
-    found: FloatArray,
-) -> bool:
+def _take_block(a: Arrays) -> bool:
     """Process the block at the end of ``blocks``; True if that closed a special segment."""
-    settle = int(setting[SETTLE])
+    state, lines, blocks, setting = a.state, a.lines, a.blocks, a.setting
     rows = int(setting[BLOCK_ROWS])
     k = state[BLOCKS]
     u, y = blocks[BLOCK_U, k], blocks[BLOCK_Y, k]
-    _learn(state, lines, histograms, u, y)
+    _learn(a, u, y)
     if state[STRETCHES] < WARM_UP and (setting[NOISE_U] <= 0.0 or setting[NOISE_Y] <= 0.0):
         # Without a noise level a break cannot be detected: start the line later.
         state[FIRST_ROW] += rows
         return False
-    noise_u, noise_y = noise_now(histograms, setting)
+    noise_u, noise_y = noise_now(a.histograms, setting)
     state[RUN_U] = _leaves(lines[LINE_U], u, noise_u, setting[BREAK], state[RUN_U])
     state[RUN_Y] = _leaves(lines[LINE_Y], y, noise_y, setting[BREAK], state[RUN_Y])
     back = 0
@@ -379,83 +338,64 @@ def _take_block(
     elif _drifts(lines, blocks, k, noise_u):
         back = _BEHIND
     if back == 0:
-        _grow(state, lines, blocks)
-        return _cut_if_long(state, lines, blocks, noise_u, noise_y, setting, found)
-    end = k - back - int(setting[TRIM])
-    closed = _close(state, blocks, end, noise_u, noise_y, setting, found)
+        _grow(a)
+        return _cut_if_long(a)
+    closed = _close(a, k - back - int(setting[TRIM]))
     # The move happened before now: the transient begins at the previous block.
     at = max(k - 1, 0)
     state[FIRST_ROW] += at * rows
     state[BLOCKS] = k + 1
-    _begin(state, lines, blocks, at, settle)
+    _begin(a, at, int(setting[SETTLE]))
     return closed
 
 
 @jit
-def _cut_if_long(
-    state: IntArray,
-    lines: FloatArray,
-    blocks: FloatArray,
-    noise_u: float,
-    noise_y: float,
-    setting: FloatArray,
-    found: FloatArray,
-) -> bool:
+def _cut_if_long(a: Arrays) -> bool:
     """Close a segment that has become too long; True if it is a special segment.
 
     The next one has no transient. Its line keeps some blocks from before the cut,
     and the last minute belongs to it, so that a move that began there is still
     detected as a break.
     """
+    state, setting = a.state, a.setting
     trim = int(setting[TRIM])
     if state[BLOCKS] < int(setting[LONGEST]) + state[SKIP] + trim:
         return False
-    closed = _close(state, blocks, state[BLOCKS] - trim, noise_u, noise_y, setting, found)
+    closed = _close(a, state[BLOCKS] - trim)
     keep = min(3 * _BEHIND, state[BLOCKS])
     drop = state[BLOCKS] - keep
     state[FIRST_ROW] += drop * int(setting[BLOCK_ROWS])
-    _begin(state, lines, blocks, drop, max(keep - trim, 0))
+    _begin(a, drop, max(keep - trim, 0))
     return closed
 
 
 @jit
-def _kind_now(
-    state: IntArray, lines: FloatArray, histograms: FloatArray, setting: FloatArray
-) -> int:
+def _kind_now(a: Arrays) -> int:
     """Return the kind of the newest row, as far as known now."""
+    state = a.state
     if state[BLOCKS] < max(state[SKIP], _LEAST):
         return TRANSIENT
     if state[RUN_U] != 0 or state[RUN_Y] != 0:
         return TRANSIENT
-    noise_u, _ = noise_now(histograms, setting)
-    slope = line_fit(lines[LINE_U])[1]
+    noise_u, _ = noise_now(a.histograms, a.setting)
+    slope = line_fit(a.lines[LINE_U])[1]
     moved = abs(slope) * state[BLOCKS] / noise_u
-    return SETTLED_SLOPE if moved >= setting[SLOPE] else SETTLED_STEADY
+    return SETTLED_SLOPE if moved >= a.setting[SLOPE] else SETTLED_STEADY
 
 
 @jit
-def _break_off(
-    state: IntArray,
-    sums: FloatArray,
-    lines: FloatArray,
-    blocks: FloatArray,
-    histograms: FloatArray,
-    setting: FloatArray,
-    found: FloatArray,
-) -> bool:
+def _break_off(a: Arrays) -> bool:
     """Close the open segment at a gap, because the operation in the gap is unknown.
 
     Return True if that closed a special segment; the row after the gap is not
     processed yet.
     """
-    closed = False
-    if state[BLOCKS] > 0:
-        noise_u, noise_y = noise_now(histograms, setting)
-        closed = _close(state, blocks, state[BLOCKS], noise_u, noise_y, setting, found)
-    _begin(state, lines, blocks, state[BLOCKS], int(setting[SETTLE]))
+    state, lines = a.state, a.lines
+    closed = state[BLOCKS] > 0 and _close(a, state[BLOCKS])
+    _begin(a, state[BLOCKS], int(a.setting[SETTLE]))
     state[FIRST_ROW] = state[ROW]
     state[ROWS_IN_BLOCK] = 0
-    sums[:] = 0.0
+    a.sums[:] = 0.0
     # The stretch for the noise must not contain a gap either.
     state[IN_STRETCH] = 0
     line_reset(lines[STRETCH_U])
@@ -464,26 +404,16 @@ def _break_off(
 
 
 @jit
-def _take_row(
-    u: float,
-    y: float,
-    temperature: float,
-    state: IntArray,
-    sums: FloatArray,
-    lines: FloatArray,
-    blocks: FloatArray,
-    histograms: FloatArray,
-    setting: FloatArray,
-    found: FloatArray,
-) -> bool:
+def _take_row(a: Arrays, u: float, y: float, temperature: float) -> bool:
     """Add a row to the current block; True if that closed a special segment."""
+    state, sums, blocks = a.state, a.sums, a.blocks
     sums[BLOCK_U] += u
     sums[BLOCK_Y] += y
     if math.isfinite(temperature):
         sums[BLOCK_T] += temperature
         sums[BLOCK_T_COUNT] += 1.0
     state[ROWS_IN_BLOCK] += 1
-    if state[ROWS_IN_BLOCK] < int(setting[BLOCK_ROWS]):
+    if state[ROWS_IN_BLOCK] < int(a.setting[BLOCK_ROWS]):
         return False
     k = state[BLOCKS]
     blocks[BLOCK_U, k] = sums[BLOCK_U] / state[ROWS_IN_BLOCK]
@@ -492,44 +422,33 @@ def _take_row(
     blocks[BLOCK_T, k] = sums[BLOCK_T] / count if count > 0.0 else math.nan
     sums[:] = 0.0
     state[ROWS_IN_BLOCK] = 0
-    return _take_block(state, lines, blocks, histograms, setting, found)
+    return _take_block(a)
 
 
 @jit
 def run(
-    time_ns: IntArray,
-    u: FloatArray,
-    y: FloatArray,
-    temperature: FloatArray,
-    state: IntArray,
-    sums: FloatArray,
-    lines: FloatArray,
-    blocks: FloatArray,
-    histograms: FloatArray,
-    setting: FloatArray,
+    time_ns: IntArray, u: FloatArray, y: FloatArray, temperature: FloatArray, a: Arrays,
     kinds: ByteArray,
-    found: FloatArray,
-) -> tuple[int, bool]:
+) -> tuple[int, bool]:  # fmt: skip
     """Process rows until they end or a special segment closes.
 
-    Return the number of rows processed, and whether ``found`` contains a segment that
+    Return the number of rows processed, and whether ``a.found`` contains a segment that
     closed at the last of them; one code per row is written to ``kinds``.
     """
-    gap_ns = int(1.5 * setting[PERIOD_NS])
+    state = a.state
+    gap_ns = int(1.5 * a.setting[PERIOD_NS])
     for i in range(u.size):
         usable = math.isfinite(u[i]) and math.isfinite(y[i])
         jumped = time_ns[i] - state[LAST_NS] > gap_ns or time_ns[i] <= state[LAST_NS]
         closed = False
         if jumped or not usable:
-            closed = _break_off(state, sums, lines, blocks, histograms, setting, found)
+            closed = _break_off(a)
         state[LAST_NS] = time_ns[i]
         state[ROW] += 1
         if usable:
-            if _take_row(
-                u[i], y[i], temperature[i], state, sums, lines, blocks, histograms, setting, found
-            ):
+            if _take_row(a, u[i], y[i], temperature[i]):
                 closed = True
-            kinds[i] = _kind_now(state, lines, histograms, setting)
+            kinds[i] = _kind_now(a)
         else:
             state[FIRST_ROW] = state[ROW]
             kinds[i] = NO_DATA

@@ -19,7 +19,7 @@ from valveflow_ros.records import (
     SegmentKind,
     SpecialSegment,
 )
-from valveflow_ros.segments import kernel as kernel
+from valveflow_ros.segments import kernel
 from valveflow_ros.segments.kernel import BINS, LINE_SIZE, WARM_UP
 from valveflow_ros.state import Memory
 
@@ -35,18 +35,12 @@ class FoundSegment:
 
 @dataclass(frozen=True, slots=True)
 class Segmented:
-    """The result of one call.
+    """The result of one call."""
 
-    Attributes
-    ----------
-    kinds : uint8 (n,)
-        Kind of each row, as far as known when it arrived:
-        `kernel.TRANSIENT`, `SETTLED_STEADY`, `SETTLED_SLOPE` or `NO_DATA`.
-    found : list of (row, FoundSegment)
-        Closed segments, each with the number of rows of this call processed by then.
-    """
-
+    # uint8 (n,): `kernel.TRANSIENT`, `SETTLED_STEADY`, `SETTLED_SLOPE` or `NO_DATA`, as far as
+    # known when the row arrived.
     kinds: ByteArray
+    # Closed segments, each with the number of rows of this call processed by then.
     found: list[tuple[int, FoundSegment]]
 
     @property
@@ -67,13 +61,6 @@ class NoiseLevel:
 class Segmenter(Memory):
     """Online segmentation in constant time per row and bounded memory.
 
-    Parameters
-    ----------
-    settings : Settings
-        Block length, transient, thresholds.
-
-    Notes
-    -----
     The segments and kinds do not depend on the division of the rows into calls
     of `feed`; they are identical bit for bit.
     """
@@ -88,49 +75,39 @@ class Segmenter(Memory):
         def in_blocks(seconds: float) -> int:
             return math.ceil(seconds / block_s - 1e-9)
 
-        setting = np.zeros(kernel.SETTINGS_SIZE)
-        setting[kernel.BLOCK_ROWS] = rows
-        setting[kernel.SETTLE] = in_blocks(settings.settle_s)
-        setting[kernel.LONGEST] = max(6, in_blocks(settings.real('longest_segment')))
-        setting[kernel.STEADY_MIN] = max(3, in_blocks(settings.real('steady_min')))
-        setting[kernel.SLOPE_MIN] = max(3, in_blocks(settings.real('slope_min')))
+        settle, longest = in_blocks(settings.settle_s), in_blocks(settings.real('longest_segment'))
         # A ramp is detected only when it exceeds the noise: up to a minute before belongs to it.
-        setting[kernel.TRIM] = min(6, in_blocks(60.0))
-        setting[kernel.BREAK] = settings.real('break_limit')
-        setting[kernel.STEADY] = settings.real('steady_limit')
-        setting[kernel.SLOPE] = settings.real('slope_limit')
-        setting[kernel.NOISE_U] = settings.real('input_noise')
-        setting[kernel.NOISE_Y] = settings.real('power_noise')
-        setting[kernel.PERIOD_NS] = period * NS_PER_S
-        self._setting = setting
+        trim = min(6, in_blocks(60.0))
+        names = 'break_limit', 'steady_limit', 'slope_limit', 'input_noise', 'power_noise'
+        self._setting = np.array([
+            rows, settle, max(6, longest), max(3, in_blocks(settings.real('steady_min'))),
+            max(3, in_blocks(settings.real('slope_min'))), trim, *map(settings.real, names),
+            period * NS_PER_S,
+        ])  # fmt: skip
         self._period_s = period
         self._block_rows = rows
         self._state = np.zeros(kernel.INT_STATE, dtype=np.int64)
-        self._state[kernel.SKIP] = int(setting[kernel.SETTLE])
-        self._state[kernel.LAST_NS] = -(2**62)
+        self._state[[kernel.SKIP, kernel.LAST_NS]] = settle, -(2**62)
         self._sums = np.zeros(kernel.SUMS)
         self._lines = np.zeros((kernel.LINES, LINE_SIZE))
-        room = int(setting[kernel.LONGEST] + setting[kernel.SETTLE] + setting[kernel.TRIM]) + 32
-        self._blocks = np.zeros((3, room))
+        self._blocks = np.zeros((3, max(6, longest) + settle + trim + 32))
         self._histograms = np.zeros((2, BINS))
         self._found = np.zeros(kernel.SEG_SIZE)
         self._number = 0
+        self._arrays = kernel.Arrays(
+            self._state, self._sums, self._lines, self._blocks, self._histograms, self._setting,
+            self._found,
+        )  # fmt: skip
 
     @classmethod
     def over(
-        cls,
-        settings: Settings,
-        number: IntArray,
-        time_ns: IntArray,
-        values: FloatArray,
-        next_number: int,
-        found_before: int = 0,
-    ) -> tuple[Segmenter, list[FoundSegment]]:
+        cls, settings: Settings, number: IntArray, time_ns: IntArray, values: FloatArray,
+        next_number: int, found_before: int = 0,
+    ) -> tuple[Segmenter, list[FoundSegment]]:  # fmt: skip
         """Return a segmenter that has processed past rows, and the segments found in them.
 
         Parameters
         ----------
-        settings : Settings
         number : int64 (n,)
             Numbers of the rows, increasing. A missing number ends the open segment.
         time_ns : int64 (n,)
@@ -164,13 +141,9 @@ class Segmenter(Memory):
         return NoiseLevel(float(u), float(y), learnt or bool(given))
 
     def feed(
-        self,
-        time_ns: IntArray,
-        u: FloatArray,
-        power_mw: FloatArray,
-        temperature_degc: FloatArray,
-        most: int | None = None,
-    ) -> Segmented:
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray,
+        temperature_degc: FloatArray, most: int | None = None,
+    ) -> Segmented:  # fmt: skip
         """Process rows; NaN in ``u`` or ``power_mw`` marks a row without usable data.
 
         Parameters
@@ -188,19 +161,9 @@ class Segmenter(Memory):
         done = 0
         while done < len(u):
             taken, closed = kernel.run(
-                time_ns[done:],
-                u[done:],
-                power_mw[done:],
-                temperature_degc[done:],
-                self._state,
-                self._sums,
-                self._lines,
-                self._blocks,
-                self._histograms,
-                self._setting,
+                time_ns[done:], u[done:], power_mw[done:], temperature_degc[done:], self._arrays,
                 kinds[done:],
-                self._found,
-            )
+            )  # fmt: skip
             done += taken
             if closed:
                 found.append((done, self._describe()))
@@ -209,7 +172,6 @@ class Segmenter(Memory):
         return Segmented(kinds[:done], found)
 
     def _describe(self) -> FoundSegment:
-        """Convert the kernel's numbers into a record."""
         f = self._found
         first, end = int(f[kernel.SEG_FIRST]), int(f[kernel.SEG_END])
         period_ns = round(self._period_s * NS_PER_S)

@@ -19,39 +19,26 @@ from valveflow_ros.segments.segmenter import FoundSegment, Segmenter
 from valveflow_ros.signals.static_form import PAPER_EXPONENT, integrated_input, pressure_of
 from valveflow_ros.state import State, perhaps
 
-# Special segments as plain values, for a saved state.
-
 _NAMES = [field.name for field in fields(SpecialSegment)]
-
-
 _WITHOUT_ENDS = len(_NAMES) - 5
 
 
-def segment_values(segment: SpecialSegment) -> list[int | float]:
-    """Return a segment's fields in their order."""
-    return [getattr(segment, name) for name in _NAMES]
+def _found_values(found: FoundSegment) -> list[Any]:
+    """Return a segment's rows and fields, for a saved state."""
+    return [found.first_row, found.end_row, *(getattr(found.segment, name) for name in _NAMES)]
 
 
-def segment_of(values: list[Any]) -> SpecialSegment:
-    """Return the segment with these values; raise `DataError` if they are invalid."""
-    try:
-        # States of earlier versions contain no openings and pressures.
-        given = dict(zip(_NAMES, values, strict=len(values) != _WITHOUT_ENDS))
-        return SpecialSegment(**{**given, 'kind': SegmentKind(given['kind'])})
-    except (TypeError, ValueError):
-        raise DataError('The saved state has a special segment that is none.') from None
-
-
-def found_values(found: FoundSegment) -> list[Any]:
-    """Return a segment's rows and fields."""
-    return [found.first_row, found.end_row, *segment_values(found.segment)]
-
-
-def found_of(values: list[Any]) -> FoundSegment:
+def _found_of(values: list[Any]) -> FoundSegment:
     """Return the segment with these values; raise `DataError` if they are invalid."""
     if [type(row) for row in values[:2]] != [int, int]:
         raise DataError('The saved state has a segment whose rows are no numbers.')
-    return FoundSegment(segment_of(values[2:]), values[0], values[1])
+    try:
+        # States of earlier versions contain no openings and pressures.
+        given = dict(zip(_NAMES, values[2:], strict=len(values) - 2 != _WITHOUT_ENDS))
+        segment = SpecialSegment(**{**given, 'kind': SegmentKind(given['kind'])})
+    except (TypeError, ValueError):
+        raise DataError('The saved state has a special segment that is none.') from None
+    return FoundSegment(segment, values[0], values[1])
 
 
 _FIRST_ROOM = 16384
@@ -63,30 +50,18 @@ _DOUBT_S = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class WindowContents:
-    """A copy of the contents of the window.
-
-    Attributes
-    ----------
-    time_ns : int64 (n,)
-    u, power_mw, temperature_degc : float64 (n,)
-        NaN in ``u`` or ``power_mw`` if a row has no usable data.
-    spans : int64 (k, 3)
-        Special segments as (first row, end row, kind), rows counted within these arrays.
-    opening_percent : float64 (n,) or (0,)
-        The opening from which u was computed, NaN if it was not given; empty if unknown.
-    command_percent : float64 (n,) or (0,)
-        The commanded opening, NaN if there was none; empty if there never was one.
-    covariates : dict of str to float64 (n,)
-        Values of further columns by entry; see `signals.covariates`.
-    """
+    """A copy of the contents of the window, n rows."""
 
     time_ns: IntArray
-    u: FloatArray
+    u: FloatArray  # NaN in u or power if a row has no usable data
     power_mw: FloatArray
     temperature_degc: FloatArray
-    spans: IntArray
+    spans: IntArray  # (k, 3) special segments as (first row, end row, kind) within these arrays
+    # The opening from which u was computed, and the commanded one, NaN if there was none; empty if
+    # there never was one.
     opening_percent: FloatArray = field(default_factory=lambda: np.empty(0))
     command_percent: FloatArray = field(default_factory=lambda: np.empty(0))
+    # Values of further columns by entry; see `signals.covariates`.
     covariates: dict[str, FloatArray] = field(default_factory=dict)
 
     def special_rows(self) -> IntArray:
@@ -101,11 +76,7 @@ class WindowContents:
 
 
 NO_ROWS = WindowContents(
-    np.empty(0, dtype=np.int64),
-    np.empty(0),
-    np.empty(0),
-    np.empty(0),
-    np.empty((0, 3), dtype=np.int64),
+    np.empty(0, dtype=np.int64), *np.empty((3, 0)), np.empty((0, 3), dtype=np.int64)
 )
 
 
@@ -213,15 +184,10 @@ class RollingWindow:
         return (span_ns + self._period_ns) / NS_PER_S
 
     def append(
-        self,
-        time_ns: IntArray,
-        u: FloatArray,
-        power_mw: FloatArray,
-        temperature_degc: FloatArray,
-        opening_percent: FloatArray | None = None,
-        command_percent: FloatArray | None = None,
-        covariates: FloatArray | None = None,
-    ) -> None:
+        self, time_ns: IntArray, u: FloatArray, power_mw: FloatArray,
+        temperature_degc: FloatArray, opening_percent: FloatArray | None = None,
+        command_percent: FloatArray | None = None, covariates: FloatArray | None = None,
+    ) -> None:  # fmt: skip
         """Append rows in chronological order; rows outside the window are dropped."""
         data = np.full((len(self._data), len(time_ns)), np.nan)
         data[0], data[1], data[2] = u, power_mw, temperature_degc
@@ -245,7 +211,7 @@ class RollingWindow:
         If it was open when the clock was set back, only the part before that is kept.
         """
         aside = self._aside
-        if aside is not None and _has(aside.number, found.end_row - 1):
+        if aside is not None and found.end_row - 1 in aside.number:
             aside.segments.append(self._with_ends(found, aside.number, aside.data))
         self._segments.extend(self._part(found))
         self._forget()
@@ -349,9 +315,7 @@ class RollingWindow:
         command = self._data[4, inside]
         return WindowContents(
             self._time_ns[inside].copy(),
-            self._data[0, inside].copy(),
-            self._data[1, inside].copy(),
-            self._data[2, inside].copy(),
+            *(column[inside].copy() for column in self._data[:3]),
             np.array(spans, dtype=np.int64).reshape(-1, 3),
             self._data[3, inside].copy(),
             # Most units do not log the command, and a snapshot is sent to another process.
@@ -368,12 +332,10 @@ class RollingWindow:
         rows, aside = self._held(), self._aside
         return {
             'seen': self._seen,
-            **self._plain(
-                _Aside(
-                    0, self._time_ns[rows], self._number[rows], self._data[:, rows],
-                    list(self._segments),
-                )
-            ),
+            **self._plain(_Aside(
+                0, self._time_ns[rows], self._number[rows], self._data[:, rows],
+                list(self._segments),
+            )),
             'aside': aside and self._plain(aside),
         }  # fmt: skip
 
@@ -391,15 +353,8 @@ class RollingWindow:
     ) -> Segmenter:
         """Replace the segments by those found with these settings; return the segmenter.
 
-        Rows set aside are dropped.
-
-        Parameters
-        ----------
-        settings : Settings
-        exponent : float
-            New m of u = V p^m of the rows; it becomes that of the window.
-        found_before : int
-            Number of segments found before; the numbering continues from it.
+        Rows set aside are dropped. ``exponent`` is the former m of u = V p^m of the rows; the
+        numbering continues from ``found_before``.
         """
         rows = slice(0, self._end)
         if exponent != self._exponent:
@@ -419,15 +374,15 @@ class RollingWindow:
         return segmenter
 
     def _clear(self) -> None:
-        """Remove all rows and segments."""
-        self._room = min(_FIRST_ROOM, self._most_room)
-        self._time_ns = np.empty(self._room, dtype=np.int64)
-        self._number = np.empty(self._room, dtype=np.int64)
-        self._data = np.empty((_SIGNALS + len(self._covariates), self._room))
+        self._allocate(min(_FIRST_ROOM, self._most_room))
         self._end = 0
 
+    def _allocate(self, room: int) -> None:
+        self._room = room
+        self._time_ns, self._number = np.empty((2, room), dtype=np.int64)
+        self._data = np.empty((_SIGNALS + len(self._covariates), room))
+
     def _add(self, time_ns: IntArray, number: IntArray, data: FloatArray) -> None:
-        """Append rows to the stored ones."""
         done = 0
         while done < len(time_ns):
             if self._end == self._room:
@@ -460,7 +415,6 @@ class RollingWindow:
         return until
 
     def _take_back(self, aside: _Aside) -> None:
-        """Replace the newer rows by the rows set aside."""
         last = aside.number[-1]
         self._end = int(np.searchsorted(self._number[: self._end], last))
         whole = {found.first_row for found in aside.segments}
@@ -471,7 +425,6 @@ class RollingWindow:
         self._add(aside.time_ns, aside.number, aside.data)
 
     def _inside(self) -> list[FoundSegment]:
-        """Return the segments inside the window, in chronological order."""
         if not self._end:
             return []
         oldest = int(self._time_ns[self._end - 1]) - self._window_ns
@@ -512,15 +465,13 @@ class RollingWindow:
             self._resize(min(self._most_room, max(_FIRST_ROOM, 2 * self._end)))
 
     def _resize(self, room: int) -> None:
-        end, self._room = self._end, room
+        end = self._end
         time_ns, number, data = self._time_ns, self._number, self._data
-        self._time_ns, self._number = np.empty(room, np.int64), np.empty(room, np.int64)
-        self._data = np.empty((len(data), room))
+        self._allocate(room)
         self._time_ns[:end], self._number[:end] = time_ns[:end], number[:end]
         self._data[:, :end] = data[:, :end]
 
     def _forget(self) -> None:
-        """Drop segments whose rows were dropped."""
         if not self._end:
             return
         first = int(self._number[self._held().start])
@@ -537,7 +488,7 @@ class RollingWindow:
             'number': rows.number.copy(),
             'rows': rows.data[:4].copy(),
             'command': command.copy() if np.isfinite(command).any() else np.empty(0),
-            'segments': [found_values(found) for found in rows.segments],
+            'segments': [_found_values(found) for found in rows.segments],
             **beside,
         }
 
@@ -555,12 +506,6 @@ class RollingWindow:
         last += [beside.get(entry, unknown) for entry in self._covariates]
         if rows.shape != (4, n) or len(number) != n or any(x.shape != (n,) for x in last):
             raise DataError('The saved state has rows of different lengths.')
-        segments = [found_of(values) for values in saved['segments']]
+        segments = [_found_of(values) for values in saved['segments']]
         data = np.concatenate([rows, np.stack(last)])
         return _Aside(perhaps(saved, 'from_ns', int) or 0, time_ns, number, data, segments)
-
-
-def _has(numbers: IntArray, number: int) -> bool:
-    """Return True if a row number is among the given ones."""
-    place = int(np.searchsorted(numbers, number))
-    return place < len(numbers) and int(numbers[place]) == number
