@@ -25,7 +25,7 @@ _OUTPUTS = {
     'slopes': 'the same for stock clients: the slopes',
     'prediction': 'each row: measured, predicted, residual, limits',
     'segments': 'each special segment when it closes',
-    'alarms': "each change of an alarm's state; what stands is told again, at least once a day",
+    'alarms': "each change of an alarm's state; active alarms are sent again at least once a day",
     'diagnosis': 'what the simulation gets wrong: verdict, causes, gain, one sentence',
     'journal': 'each decision that is not a row; it makes a replay exact',
 }

@@ -145,7 +145,7 @@ _POWER_UNITS = ('MW', 'kW', 'W', *FLOW_UNITS)
 
 _UNIT_AND_INPUTS = (
     Parameter('unit_tag', 'unit', '', 'Tag of the unit; frame_id and hardware_id of messages.'),
-    Parameter('time_zone', '', '', 'Zone in which sentences tell times, such as Europe/Berlin or '
+    Parameter('time_zone', '', '', 'Time zone of times in sentences, such as Europe/Berlin or '
               '+01:00; empty: UTC. Numbers and files stay in UTC.'),
     Parameter('autostart', True, '', 'Configure and activate the node by itself at start.'),
     Parameter(

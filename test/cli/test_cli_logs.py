@@ -252,7 +252,7 @@ def test_export_writes_what_a_monitor_said(run, logs, tmp_path):
     assert '--overwrite' in run('export', said, '-o', out, '--outputs').refused()
     assert run('export', said, '-o', out, '--outputs', '--overwrite').status == 0
     none = run('export', logs / 'plant.csv', '-o', out, '--outputs').refused()
-    assert 'holds nothing that a monitor said' in none
+    assert 'contains no monitor output' in none
 
 
 def test_recover_says_what_it_cannot_see(run, logs, tmp_path):

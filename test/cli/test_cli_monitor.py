@@ -123,15 +123,15 @@ def test_a_shift_has_the_date_of_the_cause_that_the_last_diagnosis_names(told, o
     content['causes'][0]['parameters'] = {'t0_days': {'value': onset_days, 'origin_ns': 0}}
     events = (
         raised(20, 'residual', 'Less power.'),
-        raised(24, 'curve_shift', 'Less, since when cannot be told.'),
+        raised(24, 'curve_shift', 'Less, onset unknown.'),
         replace(found, content=json.dumps(content)),
     )
     out, page, made = told(*events)
-    assert f'Less power.\nLess, since when cannot be told.{dated}\n' in out
-    assert f'<b>curve shift</b>: Less, since when cannot be told.{dated}<' in page
+    assert f'Less power.\nLess, onset unknown.{dated}\n' in out
+    assert f'<b>curve shift</b>: Less, onset unknown.{dated}<' in page
     # Without a named cause in the last diagnosis there is no date.
     gone = replace(made, events=(*events, ended(31, 'nothing', 'All agrees.')))
-    assert [words for _, words in gone.standing][1] == 'Less, since when cannot be told.'
+    assert [words for _, words in gone.standing][1] == 'Less, onset unknown.'
 
 
 def test_slow_wear_is_told(told, tmp_path):

@@ -87,5 +87,5 @@ def test_a_log_without_a_monitor_is_refused(tmp_path):
     monitor = Monitor(tmp_path / 'silent')
     monitor.say('/valve_opening', b'\x00\x01\x00\x00' + bytes(8))
     monitor.writer.close()
-    with pytest.raises(DataError, match='holds nothing that a monitor said'):
+    with pytest.raises(DataError, match='contains no monitor output'):
         write_outputs(open_log(tmp_path / 'silent'), tmp_path / 'x.csv')

@@ -225,7 +225,7 @@ def test_the_hour_that_comes_twice(tmp_path, monkeypatch, zone, block, newest_fi
     monkeypatch.setattr(file, 'BLOCK_ROWS', block)
     raw = read_table(path, options=TableOptions(time_zone=zone))
     assert raw.time_ns.tolist() == ns(truth.tz_localize(None))
-    assert any('120 rows stand in the hour that comes twice' in note for note in raw.notes)
+    assert any('120 rows are in the hour that comes twice' in note for note in raw.notes)
     if not newest_first:
         with pytest.raises(InputError, match=r'go back by an hour .* --time-zone'):
             read_table(path)

@@ -142,7 +142,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
 
     gone = 'valveflow_monitor_up{unit="/other"} 0.0'
     wait_until(lambda: gone in metrics(port), 'the end of the other monitor', 60.0)
-    assert 'The monitor has gone; this is what it said last.' in page_of(port, '/_dash-layout')
+    assert 'The monitor has stopped. Its last values are shown.' in page_of(port, '/_dash-layout')
     process.send_signal(signal.SIGTERM)
     assert process.wait(20) == 0
     assert 'Traceback' not in processes.output(process)

@@ -108,7 +108,7 @@ def test_a_mistyped_unit_or_period_costs_no_state(tmp_path: Path) -> None:
     for _ in range(2):
         with store(tmp_path, valve_opening_unit='fraction') as found:
             assert found.saved is None
-            assert 'a run that it fits takes it up again' in found.sentence
+            assert 'a run with the same settings will use it' in found.sentence
         # A young state takes its place at once.
         written(tmp_path, 1, valve_opening_unit='fraction')
         with store(tmp_path) as mended:

@@ -85,7 +85,7 @@ def _since_words(shift: Shift) -> str:
             f'to {minute(shift.since_high_ns)})'
         )
     if shift.reference_ns >= shift.first_ns > 0:
-        return 'since when cannot be told (the reference was made from the same days)'
+        return 'onset unknown (the reference was made from the same days)'
     if shift.first_ns > 0:
         return f'with no change seen since {minute(shift.first_ns)}, so from before that'
     return 'since when is not known'

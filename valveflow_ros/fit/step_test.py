@@ -335,8 +335,8 @@ def form_note(pressure: FloatArray) -> str:
     """Return a note that a test at one pressure does not determine the form of the power."""
     return (
         f'The pressure stayed between {pressure.min():.2f} and {pressure.max():.2f} MPa: whether '
-        'the power follows F(V p^m), as this curve does, or p^m F(V) + c cannot be told from '
-        'that. At other pressures the curve may be wrong.'
+        'the power follows F(V p^m), as this curve does, or p^m F(V) + c cannot be decided '
+        'from that. At other pressures the curve may be wrong.'
     )
 
 
@@ -408,7 +408,7 @@ def _characteristic(
     if line.cost:
         why = (
             'The pieces are the exact partition of the means of the levels, weighted by their '
-            'errors; their number has the least sum of squares after a price is paid for each '
+            'errors; their number has the least sum of squares plus a penalty for each '
             'number a piece takes.'
         )
         gaps = zip(line.knots[1:-1].tolist(), line.knot_error.tolist(), strict=True)

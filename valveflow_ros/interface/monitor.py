@@ -221,10 +221,10 @@ class MonitorResult(Result):
         sections = [html.Section('The answer', self._answer()), *self._nearness()]
         sections += reported.history_sections(self.history())
         foot = (
-            f'Made by valveflow {html.text(__version__)}. The same numbers, unrounded, stand in '
-            'monitor.json beside this page.'
+            f'Made by valveflow {html.text(__version__)}. The same numbers without rounding are '
+            'in monitor.json beside this page.'
         )
-        return html.Page('What the monitor would have told', lead, sections, foot, self.verb)
+        return html.Page('What the monitor would have reported', lead, sections, foot, self.verb)
 
     def _nearness(self) -> list[html.Section]:
         """Return the section on how near the residual came to an alarm; none if not judged."""

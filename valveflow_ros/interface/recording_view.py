@@ -215,7 +215,7 @@ class LogWatch:
             return 'Nothing is recorded yet.'
         if not self._heard:
             return (
-                'The recording holds no word of a monitor; "valveflow identify" finds its curve.'
+                'The recording contains no monitor output; "valveflow identify" finds its curve.'
             )
         return ''
 
@@ -231,7 +231,7 @@ class LogWatch:
         elif not name:
             return HealthView('recorder', OK, 'no file yet.')
         else:
-            level, told = WARN, f'nobody writes {name} any more, and it was not finished.'
+            level, told = WARN, f'{name} is incomplete, and no process writes to it.'
         return HealthView('recorder', WARN if lost else level, told + lost)
 
 

@@ -37,9 +37,7 @@ def outputs_in(log: LogContents) -> list[str]:
     there = {topic.type for topic in log.topics.values() if topic.count}
     found = [kind for kind, name in OUTPUTS.items() if name in there]
     if not found:
-        raise DataError(
-            f'{log.path} holds nothing that a monitor said; valveflow monitor makes it say it.'
-        )
+        raise DataError(f'{log.path} contains no monitor output; valveflow monitor computes it.')
     return found
 
 

@@ -162,7 +162,7 @@ def _listed(folder: Path) -> list[str]:
 
 # Bags that rosbag2 wrote with sqlite3, read through a temporary MCAP file.
 
-_NO_SEND_TIME = 'A bag in sqlite3 has no times of sending: values stand when they were received.'
+_NO_SEND_TIME = 'A bag in sqlite3 has no times of sending: the time of reception is used.'
 
 
 class _Copy:

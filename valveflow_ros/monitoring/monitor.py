@@ -37,7 +37,7 @@ from valveflow_ros.state import Memory, State
 
 BY_HAND = 'asked for by hand'
 BY_ITSELF = 'nothing was wrong for long enough'
-IN_TIME = 'it is from before something went wrong'
+IN_TIME = 'its data end before the fault'
 WORN = 'the curve is further from the first reference than wear_budget allows'
 OF_ITSELF = (BY_ITSELF, IN_TIME, WORN)
 _OF_CHART = {'alarm_run_length', 'alarm_block', 'alarm_floor'}
@@ -513,7 +513,7 @@ class Monitor(Memory):
                 'before and after.'
             )
         return (
-            f'Provisional: something is wrong since {minute(since_ns)}, and this curve '
+            f'Provisional: there is a fault since {minute(since_ns)}, and this curve '
             'is from the data since then. The alarms are judged by the reference.'
         )
 

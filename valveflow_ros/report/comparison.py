@@ -106,11 +106,11 @@ def finding_words(data: Compared) -> list[str]:
     stands, tested = j.passed(name, as_paper=True)
     worth, of_worth = j.passed(name, as_paper=False)
     told.append(
-        f'The paired t test of the paper, which counts each sample, lets a mean difference of '
-        f'zero stand in {stands} of {tested} segments for valveflow '
+        f'The paired t test of the paper, which counts each sample, does not reject a mean '
+        f'difference of zero in {stands} of {tested} segments for valveflow '
         f'({"simulated" if name.endswith("dynamic") else "curve"}). But the noise is correlated: '
         f'one independent value takes {say.duration(j.widening * r.trial.step_s)}. Counted so, it '
-        f'stands in {worth} of {of_worth}.'
+        f'does not reject it in {worth} of {of_worth}.'
     )
     return told
 
@@ -204,7 +204,7 @@ def comparison_page(data: Compared) -> Page:
         if data.notes else None,
     ]  # fmt: skip
     end = html.foot(
-        f'Curve <code>{html.text(c.model_id)}</code>; the same numbers, unrounded, stand in '
+        f'Curve <code>{html.text(c.model_id)}</code>; the same numbers without rounding are in '
         'comparison.json and the tables beside this page.'
     )
     lead = html.where(data_words(data), ', and '.join(spans))

@@ -202,7 +202,7 @@ def segments_table(data: Compared, segments: Sequence[JudgedSegment]) -> str:
     words = (
         "As the paper's Table III, for the segments shown: mean squared error in MW², and in "
         'brackets the t value of a mean difference of zero, first with each sample counted, then '
-        'with what correlated samples are worth. All segments stand in segments.csv.'
+        'with what correlated samples are worth. All segments are in segments.csv.'
     )
     return html.paragraph(words) + html.table(head, rows)
 

@@ -61,7 +61,7 @@ def diagnosis_page(data: Diagnosed) -> Page:
         *history_sections(data.history),
     ]  # fmt: skip
     end_of_page = html.foot(
-        'The same numbers, unrounded, stand in diagnosis.json and extended_model.json beside '
+        'The same numbers without rounding are in diagnosis.json and extended_model.json beside '
         'this page.'
     )
     lead = html.where(data.source, say.period(data.start_ns, data.end_ns))

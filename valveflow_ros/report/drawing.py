@@ -46,7 +46,7 @@ def check_drawing() -> None:
     if find_spec('matplotlib') is None:
         raise InputError(
             "--figures needs the Python package 'matplotlib', which is not installed: pip install "
-            'matplotlib. The same pictures stand in report.html, which needs nothing.'
+            'matplotlib. report.html has the same pictures and needs no library.'
         )
 
 

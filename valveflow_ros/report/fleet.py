@@ -154,7 +154,7 @@ def fleet_page(stories: Sequence[UnitStory]) -> Page:
         more = len(troubles) - _FAILURES
         sections.append(Section('What could not be done', [
             html.table(['unit', 'log', 'why'], troubles[:_FAILURES], sentences=True),
-            html.paragraph(f'{more} more stand in fleet.parquet.') if more > 0 else '',
+            html.paragraph(f'{more} more are in fleet.parquet.') if more > 0 else '',
         ]))  # fmt: skip
     return Page(
         'The fleet', html.where(told), sections,

@@ -255,9 +255,9 @@ def timeline_figure(history: History) -> Figure:
         'showlegend': bool(names),
     }  # fmt: skip
     caption = (
-        '<b>Long bars are worth a look, and bars that follow a new curve or stand in one row at '
-        'the same time.</b> A bar lasts as long as the alarm is in that state; a sign marks its '
-        'beginning, and tells the sentence when pointed at. Where there is no bar, all was normal.'
+        '<b>Look first at long bars, at bars that follow a new curve, and at bars that overlap in '
+        'time.</b> A bar lasts as long as the alarm is in that state; a sign marks its beginning '
+        'and shows the sentence when pointed at. Where there is no bar, all was normal.'
     )
     changes = say.counted(len(history.alarms), 'change')
     words = f'Time line of {say.counted(len(names), "alarm")} with {changes}.'

@@ -67,7 +67,7 @@ def identification_page(data: Identified) -> Page:
         html.section('How it was made', _settings(data.settings)),
     ]  # fmt: skip
     end_of_page = html.foot(
-        f'Curve <code>{html.text(c.model_id)}</code>; the same numbers, unrounded, stand in '
+        f'Curve <code>{html.text(c.model_id)}</code>; the same numbers without rounding are in '
         'characteristic.json beside this page.'
     )
     lead = html.where(data.source, f'{times} ({window_words(c)})')
@@ -95,7 +95,7 @@ def _read(data: Identified) -> Iterator[str]:
     c = data.characteristic
     yield html.paragraph(html.text(temperature_words(c)))
     yield html.paragraph(
-        f'Noise the thresholds stand on, as standard deviation of block means: '
+        f'Noise used for the thresholds, as standard deviation of block means: '
         f'{say.plain(c.residuals.input_noise, 3)} in u, '
         f'{say.plain(c.residuals.power_noise_mw, 3)} MW in power.'
     )

@@ -69,7 +69,7 @@ def verdict_words(data: Validated) -> list[str]:
         told.append(
             f'{data.other} has a mean squared error of {say.plain(j.mse(theirs))} MW² there, '
             f'against {say.plain(j.mse(v.judged_by))} MW² of {data.model}: '
-            + (better if v.gain.zero_is_rejected() else 'the two cannot be told apart.')
+            + (better if v.gain.zero_is_rejected() else 'the two cannot be distinguished.')
         )
     if v.outside_share > OUTSIDE_FLAG:
         told.append(
@@ -122,7 +122,7 @@ def _verdict(v: Validation) -> str:
     return (
         f'The measured power differs from the prediction by {say.plain(size, 2)} MW (root mean '
         f'square); it cannot be decided whether the characteristic is valid: {mean}{real}. '
-        f'{which} it cannot be told whether the difference is within {tolerance} or beyond. A '
+        f'{which} it cannot be decided whether the difference is within {tolerance} or beyond. A '
         'longer log, with every load in it, would help.'
     )
 
@@ -261,5 +261,5 @@ def segments_table(v: Validation, most: int = 40) -> str:
     ]  # fmt: skip
     many = say.counted(len(rows), 'segment')
     which = f'The {many} that differ most' if len(rows) < len(v.judgement.segments) else many
-    words = 'All segments stand in segments.csv, those that differ most first here.'
+    words = 'All segments are in segments.csv, those that differ most first here.'
     return html.paragraph(words) + html.folded(which, html.table(head, rows))

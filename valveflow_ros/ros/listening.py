@@ -80,7 +80,7 @@ class Listener:
     def note(self) -> str:
         """Return a sentence if the monitor has ended or is silent; otherwise empty."""
         if not self.present:
-            return 'The monitor has gone; this is what it said last.'
+            return 'The monitor has stopped. Its last values are shown.'
         return '' if self.heard else 'The monitor was found; nothing has come from it yet.'
 
     def tell(self) -> None:

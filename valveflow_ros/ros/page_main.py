@@ -81,7 +81,9 @@ class PageNode(Node):
             self._asked.put_nowait((monitor, asked, answer))
             return answer.result(timeout=_ANSWER_S)
         except (queue.Full, NoAnswer):
-            return False, f'{monitor} does not answer; nothing is known to be done.'
+            return False, (
+                f'{monitor} does not answer; it is unknown whether the request was carried out.'
+            )
 
     def pass_on(self) -> None:
         """Send the waiting requests to the monitors; the answers arrive while the node spins."""

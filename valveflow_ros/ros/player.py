@@ -116,7 +116,7 @@ class Player:
             topics = ', '.join(found.topic for found in self._predictions)
             log.info(f'Sending no faster than {topics} answers.')
         elif self._rate == 0:
-            log.info('Nobody predicts, so there is nobody to follow: 1000 samples a second.')
+            log.info('No monitor publishes predictions: 1000 samples a second.')
         done = sent = first_ns = 0
         begun_s = time.monotonic()
         for step in steps:

@@ -193,7 +193,10 @@ def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str, alarm:
                 return complain('watch', response.message)
             print(response.message, flush=True)
             return 0
-    return complain('watch', f'{node.monitor} does not answer; nothing is known to be done.')
+    return complain(
+        'watch',
+        f'{node.monitor} does not answer; it is unknown whether the request was carried out.',
+    )
 
 
 def _once(

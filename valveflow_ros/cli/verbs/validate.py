@@ -17,7 +17,7 @@ USAGE = 'LOG --model FILE -o DIR [options]'
 DESCRIPTION = """\
 Compare a characteristic with a log it was not made from: in each steady-state and
 slope-response segment of the log, how far is the measured power from the predicted one?
-Says whether the curve holds, is off (and on which piece), or cannot be told. DIR gets
+Says whether the curve is still right, is wrong (and on which piece), or cannot be judged. DIR gets
 report.html for people, validation.json and segments.csv for programs.
 
 example:

@@ -192,7 +192,7 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
         why = (
             f'Two records of one healthy unit may differ by {least:.2g} MW, also by the weather.'
             if size <= least
-            else 'That cannot be told from a slow wander of the power.'
+            else 'That cannot be distinguished from a slow variation of the power.'
         )
         return (
             f'Over the loads seen the record as a whole differs from the model given by '

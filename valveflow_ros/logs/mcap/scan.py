@@ -485,7 +485,7 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
         sentences.append(f'The {what} was not finished; everything in it was read.')
     if findings.damaged:
         sentences.append(
-            f'The {what} is damaged in {counted(findings.damaged, "place")}, what stood there was '
+            f'The {what} is damaged in {counted(findings.damaged, "place")}; the data there were '
             f'left out ({"; ".join(findings.reasons)}).'
         )
     if findings.over_budget:

@@ -453,7 +453,7 @@ class TimeReader:
         if self._clock is not None and self._clock.folded:
             notes.append(
                 f'In autumn the clock of {self.zone} is set back: {self._clock.folded} rows '
-                'stand in the hour that comes twice; its first pass was taken as summer time.'
+                'are in the hour that comes twice; its first pass was taken as summer time.'
             )
         return notes
 
@@ -470,7 +470,7 @@ class TimeReader:
         if self.kind in ('seconds', ''):
             return 'UTC'
         if self._zoned:
-            return 'as each time says'
+            return 'given in each time'
         return self.zone or 'UTC (the times name no zone)'
 
     def _from_cells(self, column: pd.Series[Any]) -> IntArray:

@@ -170,9 +170,7 @@ class Restart:
                 else:
                     yield output
         if replayer.due:
-            problems.append(
-                f'{replayer.due} of its decisions stand after rows that are not there.'
-            )
+            problems.append(f'{replayer.due} of its decisions belong to missing rows.')
 
     def _settings_then(self, saved: State) -> Settings:
         """Return the saved settings, with current values of those that the engine ignores."""

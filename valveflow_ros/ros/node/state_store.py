@@ -285,7 +285,7 @@ class StateStore:
         stays = self._folder is not None and self._folder.set_aside()
         kept = 'It stays beside the new one' if stays else f'It is not kept beside {ASIDE}'
         then = (
-            f'{kept}, and a run that it fits takes it up again.' if whole and stays else
+            f'{kept}, and a run with the same settings will use it.' if whole and stays else
             f'{kept}. Window, standing alarms and reference of before are '
             'gone; curves of before stand there as curve_*.json, for reference_file.'
         )  # fmt: skip
