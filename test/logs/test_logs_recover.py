@@ -532,3 +532,20 @@ def test_a_whole_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatc
         act(tmp_path)
         assert done == ['fsync', 'replace', 'folder']
         done.clear()
+
+
+OUTSIDE = (Opcode.HEADER, Opcode.DATA_END, Opcode.STATISTICS, Opcode.CHUNK_INDEX,
+           Opcode.MESSAGE_INDEX, Opcode.FOOTER)  # fmt: skip
+
+
+@pytest.mark.parametrize('kind', OUTSIDE)
+def test_a_changed_byte_outside_of_the_chunks_is_reported_and_costs_no_message(tmp_path, kind):
+    (sound, _, _), hurt = write_chunks(tmp_path / 'recording'), tmp_path / 'hurt.mcap'
+    assert recover(sound, tmp_path / 'again.mcap').warnings == ()
+    content = bytearray(sound.read_bytes())
+    at = next(start for op, start, _ in records(content) if op == kind)
+    content[at + 11] ^= 1
+    hurt.write_bytes(content)
+    report = recover(hurt, tmp_path / 'mended.mcap')
+    assert 'damaged' in ' '.join(report.warnings)
+    assert stock(tmp_path / 'mended.mcap') == stock(sound)

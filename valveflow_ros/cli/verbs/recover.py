@@ -47,7 +47,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
     text = (
         f'Kept {counted(report.messages, "message")} in {counted(report.chunks, "chunk")}; '
         f'{lost}. '
-        'Index and summary were written anew. Metadata has no checksum: damage there is not seen.'
+        'Index and summary were written anew.'
         f'\nRead {count(report.bytes_read)} bytes, wrote {count(report.bytes_written)} '
         f'to {report.out}.'
     )

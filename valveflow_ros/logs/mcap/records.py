@@ -217,6 +217,17 @@ def ends_well(source: Source) -> bool:
     return raw.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and raw.endswith(MAGIC)
 
 
+def summary_damaged(source: Source) -> bool:
+    """Return True if a finished file has a summary that cannot be read or has a wrong checksum."""
+    footer_at = source.size - len(MAGIC) - FOOTER_SIZE
+    raw = source.read(footer_at, FOOTER_SIZE)
+    footer = unpack(Footer.read, raw[RECORD_HEAD.size :])
+    if footer.summary_start == 0:
+        return footer.summary_crc not in (0, zlib.crc32(raw[:-4]))
+    # A summary that is too large to be read was not damaged.
+    return footer_at - footer.summary_start <= RECORD_BYTES and read_summary(source) is None
+
+
 def read_summary(source: Source) -> Summary | None:
     """Return the summary, or ``None`` if there is none or its checksum is wrong."""
     if not ends_well(source):

@@ -41,6 +41,7 @@ from valveflow_ros.logs.mcap.records import (
     ends_well,
     leading_messages,
     pack,
+    summary_damaged,
     unpack,
     unpack_attachment,
 )
@@ -139,8 +140,8 @@ class Findings:
     """What a scan found besides the content of intact chunks.
 
     ``unchecked`` of the ``chunks`` have no checksum; ``bare_messages`` are outside of chunks.
-    If there are any, ``whole`` is True if the checksum of the whole data section is correct, and
-    None if the file has none.
+    ``whole`` is True if the checksum of the whole data section is correct, and None if the file
+    has none. ``summary_damaged`` is True if the summary of a finished file cannot be used.
     """
 
     chunks: int = 0
@@ -148,6 +149,7 @@ class Findings:
     unchecked: int = 0
     bare_messages: int = 0
     whole: bool | None = None
+    summary_damaged: bool = False
     finished: bool = False
     cut_off_at: int | None = None
     begins_well: bool = True
@@ -202,6 +204,7 @@ class Scanner:
     def _follow(self) -> Iterator[Chunk]:
         source, findings = self._source, self.findings
         findings.finished = ends_well(source)
+        findings.summary_damaged = findings.finished and summary_damaged(source)
         findings.begins_well = source.read(0, len(MAGIC)) == MAGIC
         position = len(MAGIC) if findings.begins_well else 0
         while position < source.size and not self._is_end(position):
@@ -379,10 +382,10 @@ class Scanner:
         return self._seek(start, start + length)
 
     def _data_end(self, position: int) -> None:
-        """Verify the checksum of the data section if some records have none of their own."""
+        """Verify the checksum of the data section, which covers records without their own."""
         raw = self._source.read(position + RECORD_HEAD.size, 4)
         wanted = int.from_bytes(raw, 'little')
-        if wanted and (self.findings.unchecked or self.findings.bare_messages):
+        if wanted:
             found = 0
             for start in range(0, position, _WINDOW):
                 found = zlib.crc32(self._source.read(start, min(_WINDOW, position - start)), found)
@@ -492,12 +495,19 @@ def scan_warnings(findings: Findings, what: str) -> tuple[str, ...]:
         sentences.append(
             f'The {what} unpacks to far more than its size justifies; the rest of it was not read.'
         )
-    if findings.whole is False:
+    chunks, messages = findings.unchecked, findings.bare_messages
+    if findings.whole is False and (chunks or messages):
         sentences.append(
             f'The checksum of all records of the {what} is wrong; damage in what has no checksum '
             'of its own cannot be located.'
         )
-    chunks, messages = findings.unchecked, findings.bare_messages
+    elif findings.whole is False and not findings.damaged:
+        sentences.append(
+            f'Bytes of the {what} outside of its chunks are damaged (its checksum is wrong); '
+            'every chunk of messages is intact.'
+        )
+    if findings.summary_damaged:
+        sentences.append(f'The summary of the {what} is damaged; the messages do not need it.')
     unchecked = []
     if chunks:
         one = f'chunk of the {what} was', f'chunks of the {what} were'
