@@ -125,41 +125,13 @@ def _record(name: str, view: dict[str, Any]) -> Path:
     return _save(figure, name)
 
 
-def curve() -> Path:
-    """Draw the curve with its band over the density of the special samples."""
-    data = json.loads((DATA / 'curve.json').read_text())
-    x, y = np.array(data['x']), np.array(data['y'])
-    counts = np.zeros((len(x) - 1, len(y) - 1))
-    for i, j, n in data['cells']:
-        counts[i, j] = n
-    figure, axis = plt.subplots(figsize=(9, 4.6))
-    axis.pcolormesh(x, y, np.ma.masked_equal(np.log1p(counts), 0.0).T, cmap='Blues',
-                    vmin=-1.5, rasterized=True)  # fmt: skip
-    for k, piece in enumerate(data['pieces']):
-        u, mw, error = (np.array(piece[key]) for key in ('u', 'mw', 'error'))
-        axis.fill_between(u, mw - 1.96 * error, mw + 1.96 * error, color=INK, alpha=0.25, lw=0,
-                          label='95 % band' if k == 0 else None)  # fmt: skip
-        axis.plot(u, mw, color=INK, lw=2, label='flow characteristic' if k == 0 else None)
-    for k, ((low, high), piece) in enumerate(
-        zip(data['breakpoint_intervals'], data['pieces'], strict=False)
-    ):
-        at, mw = piece['u'][-1], piece['mw'][-1]
-        axis.errorbar([at], [mw], xerr=[[at - low], [high - at]], fmt='o', color=INK, mfc='white',
-                      capsize=4, label='breakpoints, 95 %' if k == 0 else None)  # fmt: skip
-    axis.set_xlabel('integrated input u = V p^(9/8)  (% MPa^9/8)')
-    axis.set_ylabel('generated power (MW)')
-    axis.legend(loc='lower right')
-    figure.tight_layout()
-    return _save(figure, 'curve')
-
-
 def main(names: list[str]) -> int:
     """Draw what is named, or everything there are data for."""
-    for name in names or ['curve', *CASES]:
+    for name in names or CASES:
         if not (DATA / f'{name}.json').exists():
             print(f'{name}: no data; run python -m docs.picture_data {name}')
             continue
-        path = curve() if name == 'curve' else effect(name)
+        path = effect(name)
         print(f'{path.name}: {path.stat().st_size // 1024} kB')
     return 0
 

@@ -93,12 +93,30 @@ def studies() -> str:
 
 
 def gallery() -> str:
-    """Return the pictures of reports, page and effects."""
-    parts = ['# Gallery\n', '[The examples in Python as a notebook](python.ipynb).\n']
-    for path in sorted((ROOT / 'docs' / 'pictures').glob('*.*g')):
-        effect = (ROOT / 'docs' / 'effects' / f'{path.stem}.md').exists()
-        title = f'[{path.stem}](effects/{path.stem}.md)' if effect else path.stem
-        parts.append(f'## {title}\n\n![{path.stem}](pictures/{path.name})\n')
+    """Return the pictures of reports, page and effects, each with the caption of its page."""
+    pages = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+    captions = {}
+    for page in pages:
+        text = page.read_text()
+        for caption, name in re.findall(r'!\[(.*?)\]\([^)]*pictures/(\S+)\)', text):
+            effect = page.parent.name == 'effects'
+            captions[name] = (
+                f'[{text.splitlines()[0].lstrip("# ")}](effects/{page.name})'
+                if effect
+                else caption
+            )
+    parts = ['# Gallery\n', '[The examples in Python](notebook.md).\n']
+    parts += [f'![{name}](pictures/{name})\n\n{captions[name]}\n' for name in sorted(captions)]
+    return '\n'.join(parts)
+
+
+def notebook() -> str:
+    """Return the notebook of the handbook as a page."""
+    parts = ['[As a notebook](python.ipynb).\n']
+    for cell in json.loads((ROOT / 'docs' / 'python.ipynb').read_text())['cells']:
+        text = ''.join(cell['source'])
+        parts.append(f'```python\n{text}\n```\n' if cell['cell_type'] == 'code' else f'{text}\n')
+    parts[:2] = parts[1::-1]  # the title comes first
     return '\n'.join(parts)
 
 
@@ -107,7 +125,7 @@ def main() -> int:
     shutil.rmtree(SOURCE, ignore_errors=True)
     pages = {
         'reference/verbs.md': verbs(), 'reference/python.md': interface(),
-        'studies.md': studies(), 'gallery.md': gallery(),
+        'studies.md': studies(), 'gallery.md': gallery(), 'notebook.md': notebook(),
         'CHANGELOG.md': changes((ROOT / 'CHANGELOG.rst').read_text()),
         **{name: turned((ROOT / name).read_text(), 'docs/') for name in PROJECT},
     }  # fmt: skip

@@ -182,47 +182,11 @@ def gather(name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def curve() -> dict[str, Any]:
-    """Identify a healthy plant, and return curve, band and density of the special samples."""
-    from valveflow_ros.curve.characteristic_json import to_json
-    from valveflow_ros.interface.identify import identify
-    from valveflow_ros.logs import write_table
-    from valveflow_ros.plant.simulator import simulate
-    from valveflow_ros.report.curve import band
-
-    log = simulate(3, 1)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / 'plant.parquet'
-        write_table(log.table, path)
-        found = identify(path).data
-    u, power = found.u[found.special], found.power[found.special]
-    counts, x, y = np.histogram2d(u, power, bins=(110, 70))
-    pieces = []
-    for piece in found.characteristic.pieces:
-        at = np.linspace(piece.u_from, piece.u_to, 25)
-        pieces.append(
-            {
-                'u': _numbers(at), 'mw': _numbers(piece.slope * at + piece.intercept),
-                'error': _numbers(band(piece, u, at)),
-            }
-        )  # fmt: skip
-    kept = np.argwhere(counts > 0)
-    return {
-        'command': 'valveflow simulate -o plant.mcap --days 3',
-        'x': _numbers(x), 'y': _numbers(y),
-        'cells': [[int(i), int(j), int(counts[i, j])] for i, j in kept],
-        'pieces': pieces,
-        'breakpoint_intervals': to_json(found.characteristic)['breakpoint_intervals'],
-        'true_knots': _numbers(log.unit.curve.knots),
-        'samples': len(u),
-    }  # fmt: skip
-
-
 def main(names: list[str]) -> int:
     """Gather what is named, or all."""
     DATA.mkdir(parents=True, exist_ok=True)
-    for name in names or ['curve', *CASES]:
-        data = curve() if name == 'curve' else gather(name)
+    for name in names or CASES:
+        data = gather(name)
         (DATA / f'{name}.json').write_text(json.dumps(data, separators=(',', ':')) + '\n')
         print(name, data.get('sentence', ''), flush=True)
     return 0

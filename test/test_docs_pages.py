@@ -52,7 +52,7 @@ def test_every_effect_has_a_page_a_picture_and_a_case_and_nothing_else_has() -> 
     assert set(causes()) <= known
     assert set(page_effects.names()) == known
     assert {p.stem for p in (DOCS / 'effects').glob('*.md')} - {'README'} == known
-    assert {p.stem for p in PICTURES.glob('*.svg')} == known | {'curve'}
+    assert {p.stem for p in PICTURES.glob('*.svg')} == known
     assert set(picture_data.CASES) == known
 
 
