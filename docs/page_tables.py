@@ -85,10 +85,18 @@ def output_topics() -> dict[str, tuple[str, bool]]:
     """Return type and whether it is latched of every output topic of the node."""
     found = _literal('node/outputs.py', 'OUTPUTS')
     assert isinstance(found, ast.Dict)
+    tree = ast.parse((_NODE / 'node/outputs.py').read_text())
+    package = {
+        alias.name: node.module.partition('.')[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
     topics = {}
     for key, call in zip(found.keys, found.values, strict=True):
-        _, kind, latched = (call.args if isinstance(call, ast.Call) else [])[:3]
-        topics[_text(key)] = _text(kind).replace('/msg/', '/'), bool(ast.literal_eval(latched))
+        kind, latched = (call.args if isinstance(call, ast.Call) else [])[:2]
+        name = ast.unparse(kind)
+        topics[_text(key)] = f'{package[name]}/{name}', bool(ast.literal_eval(latched))
     return topics
 
 

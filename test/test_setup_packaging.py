@@ -148,10 +148,10 @@ def test_what_apt_does_not_bring_is_said_with_the_command(arguments):
     needed = {NAME.match(need)[0] for need in arguments['install_requires']}
     by_apt = {key.removeprefix('python3-').replace('yaml', 'pyyaml') for key in keys('.')}
     by_mcap = {'lz4', 'zstandard'}
-    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
-    line = re.search(r'pip install --break-system-packages (.*)', readme)[1]
+    page = (ROOT / 'docs' / 'jazzy.md').read_text(encoding='utf-8')
+    line = re.search(r'pip install --break-system-packages (.*)', page)[1]
     assert set(line.split()) == needed - by_apt - by_mcap | {"'pyarrow<26'"}
-    assert 'rosdep install --from-paths src src/valveflow_ros/msg ' in readme
+    assert 'rosdep install --from-paths src src/valveflow_ros/msg ' in page
 
 
 def test_the_tests_load_without_what_apt_does_not_bring():
