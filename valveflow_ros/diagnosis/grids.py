@@ -339,14 +339,16 @@ def blur_of(v: FloatArray, step_s: float, compression: Compression | None) -> Bl
         Opening in %, row by row.
     """
     if compression is not None:
-        interval_s = compression.interval_s
+        # Lags show in the power: its values must be closer together than they last.
+        power = compression.updates.get(Signal.GENERATED_POWER)
+        interval_s = compression.interval_s if power is None else power.interval_s
         opening = compression.updates.get(Signal.VALVE_OPENING)
         band = 0.0 if opening is None else _BANDS_HIDDEN * opening.dead_band
         return Blur(
-            max(0.5 * interval_s, step_s if step_s >= COARSE_STEP_S else 0.0),
+            max(interval_s, step_s if step_s >= COARSE_STEP_S else 0.0),
             max(band, _usual_move(v)),
-            f'cannot be judged: values of this compressed log are typically {interval_s:.0f} s '
-            'apart, which hides',
+            'cannot be judged: values of the power in this compressed log are typically '
+            f'{interval_s:.0f} s apart, which hides',
             True,
         )  # fmt: skip
     if step_s < COARSE_STEP_S:

@@ -19,7 +19,13 @@ from valveflow_ros.curve.characteristic import FormEvidence
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.partition.partition import partition
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
-from valveflow_ros.signals.static_form import EXPONENTS, INTEGRATED_INPUT, OPENING, StaticForm
+from valveflow_ros.signals.static_form import (
+    EXPONENTS,
+    INTEGRATED_INPUT,
+    OPENING,
+    StaticForm,
+    exponents_near,
+)
 
 _MEAN_S = 60.0
 _KNOTS = 10
@@ -142,12 +148,16 @@ def find_form(
                 len(means), _LEAST_MEANS, 'A longer log would help.',
             )  # fmt: skip
         return None if held is None else FoundForm(held, 0.0, None, True)
-    choked = known.exponent if known is not None and known.scaled else _CHOKED_EXPONENT
+    within = exponents_near(exponent)
+    ideal = _CHOKED_EXPONENT if within == EXPONENTS else exponent
+    choked = known.exponent if known is not None and known.scaled else ideal
     usual = known if known is not None and not known.scaled else None
     paper = _with_exponent(means, usual or StaticForm(INTEGRATED_INPUT, exponent))
     low, middle, high = np.quantile(means.pressure, (0.02, 0.5, 0.98))
     moves = bool(high - low > _LEAST_RANGE * middle)
-    scaled = _best(means, OPENING) if moves else _fitted(means, StaticForm(OPENING, choked))
+    scaled = (
+        _best(means, OPENING, within) if moves else _fitted(means, StaticForm(OPENING, choked))
+    )
     if known is not None and known.scaled:
         scaled = _with_exponent(means, known)
     given = held is not None
@@ -262,7 +272,8 @@ def _place(x: FloatArray, parts: int) -> IntArray:
 
 def _with_exponent(means: _Means, given: StaticForm) -> _Fit:
     """Return a fit with the given exponent, or with another one that is significantly better."""
-    free, fitted = _best(means, given.axis), _fitted(means, given)
+    near = exponents_near(given.exponent)
+    free, fitted = _best(means, given.axis, near), _fitted(means, given)
     gain, _, told = _told(means, free, fitted, _EXPONENT_APART)
     return free if told and gain > _EXPONENT_GAIN else fitted
 
@@ -296,17 +307,17 @@ def _means_of(
     return _Means(v, p, y, rate, goes_on > 0.0)
 
 
-def _best(means: _Means, axis: str) -> _Fit:
+def _best(means: _Means, axis: str, within: tuple[float, float]) -> _Fit:
     """Return a fit with the exponent that has the smallest error on held-out stretches."""
 
     def cost(exponent: float) -> float:
         return float(_surprise(_fitted(means, StaticForm(axis, exponent)).error).sum())
 
-    low, high = EXPONENTS
+    low, high = within
     best = low
     for step in _EXPONENT_STEPS:
         best = min(np.arange(low, high + 1e-9, step).round(4).tolist(), key=cost)
-        low, high = max(EXPONENTS[0], best - step), min(EXPONENTS[1], best + step)
+        low, high = max(within[0], best - step), min(within[1], best + step)
     return _fitted(means, StaticForm(axis, best))
 
 

@@ -38,7 +38,7 @@ from valveflow_ros.fit.problem import (
 from valveflow_ros.fit.uncertainty import covariance_of
 from valveflow_ros.fit.whitening import ORDER, fit_ar
 from valveflow_ros.records import BoolArray, ByteArray, FloatArray
-from valveflow_ros.signals.static_form import EXPONENTS
+from valveflow_ros.signals.static_form import exponents_near
 
 # Correction of the errors of the measured input, which make the plant seem too slow.
 #
@@ -401,7 +401,7 @@ def _with_exponent(
     None if the exponent is to be ``kept`` unless another one is clearly better, and none is.
     """
     free, by, error = free_parameters(model), 0.0, math.nan
-    low, high = EXPONENTS[0] - exponent, EXPONENTS[1] - exponent
+    low, high = (limit - exponent for limit in exponents_near(exponent))
     for _ in range(_EXPONENT_ROUNDS):
         problem = Problem(coarse.with_exponent(by))
         ar = fit_ar(*problem.answer(model))

@@ -223,6 +223,7 @@ def _line_errors(m: RegionalModel, covariance: FloatArray) -> tuple[FloatArray, 
 
 NOT_REFINED = 'The curve is not refined: '  # beginning of a note on that
 _SMALL = 0.05  # half of a small 95 % interval, relative to the slope
+_MOST_PERCENT = 100.0  # an opening beyond it is no advice
 _LEAST_ROWS = 30  # minimum rows of a segment inside a piece to be counted
 _APART = 10.0  # minimum difference of two distinct levels, in noise sd of u
 
@@ -366,6 +367,8 @@ def _operation(c: Characteristic, piece: Piece, u: float) -> str:
     if not math.isfinite(pressure):
         return power
     opening = u / pressure**c.pressure_exponent
+    if opening > _MOST_PERCENT:
+        return power
     return f'{opening:.0f} % opening ({power} at {pressure:.1f} MPa)'
 
 

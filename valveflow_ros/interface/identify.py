@@ -197,7 +197,7 @@ def _identified(
         form = None if reference is None else reference.static_form
         form = form if model is None else model.form
         observed = replace(observed, task=replace(observed.task, form=form))
-        characteristic = observed.fit(progress)
+        characteristic = _without_hidden_times(observed.fit(progress), log)
     except DataError as error:
         table, _, counts = align_whole(log.readings, settings)
         read = _rows_as_read(log.readings)
@@ -236,6 +236,24 @@ def _identified(
         settings.real('sample_period'),
     )  # fmt: skip
     return replace(found, misfit=misfit)
+
+
+def _without_hidden_times(c: Characteristic, log: Log) -> Characteristic:
+    """Return the curve with times as uncertain as the power of a compressed log is far apart."""
+    power = log.compression and log.compression.updates.get(Signal.GENERATED_POWER)
+    if not power:
+        return c
+    dynamics = tuple(
+        replace(
+            region,
+            time_constant_stderr_s=max(region.time_constant_stderr_s, power.interval_s),
+            delay_stderr_s=max(region.delay_stderr_s, power.interval_s),
+        )
+        if region.time_constant_s < power.interval_s
+        else region
+        for region in c.dynamics
+    )
+    return replace(c, dynamics=dynamics)
 
 
 def _inputs(table: SampleTable) -> tuple[FloatArray, FloatArray]:

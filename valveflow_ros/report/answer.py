@@ -94,8 +94,8 @@ def form_words(c: Characteristic) -> str:
     if not form.told:
         return (
             f'Whether the power follows {mine}, as this curve does, or {form.other} cannot be '
-            f'told from these data: {forms_apart(form)}. Where the pressure leaves the range of '
-            'these data the curve may be wrong.'
+            f'decided from these data: {forms_apart(form)}. Where the pressure leaves the range '
+            'of these data the curve may be wrong.'
         )
     if c.axis != OPENING:
         return ''
@@ -195,7 +195,7 @@ def answer_words(data: Identified) -> str:
         f'({say.counted(c.source.samples, "sample")}). The typical difference between curve and '
         f'samples is {say.plain(c.residuals.rmse_mw, 2)} MW. {pieces_doubt(c)}'
     )
-    told = [html.text(doubt(data))]
+    told = []
     if c.source.temperature_flag:
         limit = say.plain(data.settings.real('temperature_spread_limit'))
         told.append(
@@ -211,7 +211,9 @@ def answer_words(data: Identified) -> str:
         )
     told += [html.text(n) for n in (say.held_words(c.held), *c.notes)]
     form = form_words(data.characteristic)
-    said = html.paragraph(words, 'answer') + (html.paragraph(html.text(form)) if form else '')
+    doubts = doubt(data)
+    said = html.notice(html.text(doubts)) if doubts else ''
+    said += html.paragraph(words, 'answer') + (html.paragraph(html.text(form)) if form else '')
     return said + ''.join(html.notice(n) for n in told if n)
 
 

@@ -26,6 +26,12 @@ PAPER_EXPONENT = 1.125
 EXPONENTS = 0.9, 1.25
 
 
+def exponents_near(exponent: float) -> tuple[float, float]:
+    """Return the range in which to search: around an unusual one, as 0.5 of a liquid, 20 %."""
+    low, high = EXPONENTS
+    return EXPONENTS if low <= exponent <= high else (0.8 * exponent, 1.2 * exponent)
+
+
 @dataclass(frozen=True, slots=True)
 class StaticForm:
     """The argument and the factor of the curve.

@@ -96,9 +96,9 @@ def _text(found: Identified) -> str:
     c = found.characteristic
     return command.lines(
         f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
+        answer.doubt(found),
         f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
         f'{percent(answer.explained(found))} of the variance of the power.',
-        answer.doubt(found),
         answer.pieces_doubt(c),
         answer.form_words(c),
         _by_load(found),
