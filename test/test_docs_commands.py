@@ -88,7 +88,7 @@ def test_every_command_is_one_the_programs_take() -> None:
     assert len(blocks) > 50
     for block in blocks:
         for words in commands(block):
-            while '=' in words[0] or words[0] in ('nice', 'sudo'):
+            while words and ('=' in words[0] or words[0] in ('nice', 'sudo')):
                 words = words[1:]
             try:
                 _check(words)
