@@ -203,9 +203,11 @@ def test_confidence_and_support_stand_in_the_page(identified):
     for part in (
         'The number of pieces is not certain: 2 has a probability of 66.0 %, 3 of 34.0 %. The '
         '95 % intervals', 'all others together less than 0.1 %', '1 steady state at 1 level',
-        '3 steady states at 2 levels, 2 slope responses', 'slope uncertain',
+        '3 steady states at 2 levels, 2 slope responses',
     ):  # fmt: skip
         assert part in words_of(html), part
+    uncertain = ('slope uncertain', 'follows from the pieces beside it')
+    assert sum(html.count(words) for words in uncertain) == 1
     assert 'more than 99.9 %' in confidence_table(replace(choice, confidence={2: 1.0}))
 
 
