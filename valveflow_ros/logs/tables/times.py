@@ -11,7 +11,7 @@ import re
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import tzinfo
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -135,15 +135,11 @@ def tidied(text: str) -> str:
 
 def english(text: str) -> str:
     """Return a date with an English month abbreviation and hyphens, such as 5-mar-2026."""
-    found = _NAMED.match(text)
-    if found:
-        head = f'{found[1]}-{_month(found[2])}-{found[3]}'
-    else:
-        found = _NAMED_FIRST.match(text)
-        if not found:
-            return text
-        head = f'{_month(found[1])}-{found[2]}-{found[3]}'
-    return head + _BETWEEN.sub(' ', text[found.end() :]).replace(',', ' ', 1)
+    found = _NAMED.match(text) or _NAMED_FIRST.match(text)
+    if not found:
+        return text
+    words = (word if word.isdigit() else _month(word) for word in found.groups())
+    return '-'.join(words) + _BETWEEN.sub(' ', text[found.end() :]).replace(',', ' ', 1)
 
 
 def _month(word: str) -> str:
@@ -183,8 +179,7 @@ class LocalClock:
         first, second = from_stamps(summer), from_stamps(winter)
         twice = (first != second) & ~missing
         if not twice.any():
-            known = stamps[~missing]
-            if len(known):
+            if not missing.all():
                 self._last, self._second = None, False
             return summer.dt.tz_convert('UTC')
         later = self._later(from_stamps(stamps), twice)
@@ -527,18 +522,14 @@ class TimeReader:
         kind = 'datetime64[ns, UTC]' if style.zoned else 'datetime64[ns]'
         found = pd.Series(pd.NaT, index=text.index, dtype=kind)
         left = text.notna().to_numpy(dtype=bool)
-        for form in style.formats:
+        for form, suffix in product(style.formats, ('%z', ' %z') if style.zoned else ('',)):
             if not left.any():
                 break
-            suffixes = ('%z', ' %z') if style.zoned else ('',)
-            for suffix in suffixes:
-                read = pd.to_datetime(
-                    text[left], format=form + suffix, errors='coerce', utc=style.zoned
-                )
-                found[left] = read.astype(kind)
-                left = found.isna().to_numpy() & text.notna().to_numpy(dtype=bool)
-                if not left.any():
-                    break
+            read = pd.to_datetime(
+                text[left], format=form + suffix, errors='coerce', utc=style.zoned
+            )
+            found[left] = read.astype(kind)
+            left = found.isna().to_numpy() & text.notna().to_numpy(dtype=bool)
         return found, left
 
     def _from_local(self, stamps: pd.Series[Any]) -> IntArray:
