@@ -44,16 +44,16 @@ def fitted(monitor):
 
 
 @cache
-def learnt(settings=SETTINGS) -> Monitor:
+def learnt(axis='auto') -> Monitor:
     """Return a monitor that has a curve of the first two days."""
-    monitor = Monitor(settings)
+    monitor = Monitor(SETTINGS.changed({'axis': axis}))
     feed_rows(monitor, plant().part(0, 2 * DAY))
     fitted(monitor)
     return monitor
 
 
-def again(settings=SETTINGS) -> Monitor:
-    return taken_up(learnt(settings), Monitor(settings))
+def again(axis='auto') -> Monitor:
+    return taken_up(learnt(axis), Monitor(SETTINGS.changed({'axis': axis})))
 
 
 def rms(events) -> float:
@@ -63,7 +63,7 @@ def rms(events) -> float:
 
 
 def test_the_curve_has_its_knees_at_openings_and_predicts_better_than_the_paper_s_form():
-    monitor, paper = again(), again(SETTINGS.changed({'axis': INTEGRATED_INPUT}))
+    monitor, paper = again(), again(INTEGRATED_INPUT)
     curve = monitor.characteristic
     assert (curve.axis, curve.form.told) == (OPENING, True)
     assert paper.characteristic.static_form == StaticForm()

@@ -40,19 +40,26 @@ NORMAL, UNACKNOWLEDGED, _, RETURNED, *_ = AlarmState
 N = 3000
 
 
+RUNS = {
+    'by hand': (BY_HAND, 700), 'by itself': (BY_TIME, N),
+    'never': (BY_TIME.changed({'reference_after': 0.0}), N),
+}  # fmt: skip
+
+
 @cache
-def _run(settings, rows):
+def _run(name):
+    settings, rows = RUNS[name]
     monitor = Monitor(settings)
     return monitor, feed_rows(monitor, plant_table(1, rows))
 
 
 def with_curve():
-    return taken_up(_run(BY_HAND, 700)[0], Monitor(BY_HAND))
+    return taken_up(_run('by hand')[0], Monitor(BY_HAND))
 
 
 def healthy():
     """Return a monitor that has made a reference by itself."""
-    return taken_up(_run(BY_TIME, N)[0], Monitor(BY_TIME))
+    return taken_up(_run('by itself')[0], Monitor(BY_TIME))
 
 
 def named(events, name):
@@ -130,12 +137,12 @@ def test_a_curve_that_cannot_be_compared_says_why():
 
 
 def test_a_curve_becomes_the_reference_by_itself_unless_that_is_left_to_the_operator():
-    monitor, events = _run(BY_TIME, N)
+    monitor, events = _run('by itself')
     (told, *_) = of_type(events, ReferenceSet)
     assert told.characteristic in [e.characteristic for e in of_type(events, CurveAdopted)]
     assert monitor.predicting is monitor.reference.curve
     assert any(getattr(e, 'text', '') == BY_ITSELF for e in events)
-    monitor, events = _run(BY_TIME.changed({'reference_after': 0.0}), N)
+    monitor, events = _run('never')
     assert of_type(events, CurveAdopted)
     assert not of_type(events, ReferenceSet)
     assert monitor.reference.curve is None

@@ -221,7 +221,7 @@ def with_value(value, *at):
         (LINE, LINE, {'min_distinct': 1}, ParameterError, 'min_distinct'),
         (LINE, LINE, {'threads': 0}, ParameterError, 'threads'),
         *((LINE, LINE, {'weight': weight}, DataError, words) for weight, words in (
-            ([1.0, 2.0], 'as long as u'), (with_value(0.0, 1), r'weight\[1\] is 0'),
+            ([1.0, 2.0], 'as long as u'), (np.where(LINE == 1, 0.0, 1.0), r'weight\[1\] is 0'),
             (with_value(math.nan, 0), r'weight\[0\] is nan'), (['a'] * 9, 'real numbers'),
         )),
     ],

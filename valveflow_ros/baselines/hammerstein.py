@@ -320,6 +320,15 @@ def knots_to_try(u: FloatArray, pieces: int) -> list[FloatArray]:
     return tried if pieces > 1 else tried[:1]
 
 
+def first_order(
+    knots: FloatArray, time_constant_s: float, delay_s: float, step_s: float
+) -> HammersteinModel:
+    """Return a model with one pole and a flat curve."""
+    denominator = np.array([-np.exp(-step_s / time_constant_s)])
+    delay = round(delay_s / step_s)
+    return HammersteinModel(knots, np.zeros(len(knots)), np.empty(0), denominator, delay, step_s)
+
+
 def with_best_values(samples: Samples, model: HammersteinModel) -> tuple[HammersteinModel, float]:
     """Return the model with the values at the knots that fit best, and its squared error.
 
@@ -339,14 +348,10 @@ def starts(samples: Samples, pieces: int) -> list[HammersteinModel]:
     u, step_s = samples.u[samples.usable > 0], samples.step_s
     found = []
     for knots in knots_to_try(u, pieces):
-        first_order = (
-            HammersteinModel(
-                knots, np.zeros(len(knots)), np.empty(0), np.array([-np.exp(-step_s / t)]),
-                round(d / step_s), step_s,
-            )
+        tried = [
+            with_best_values(samples, first_order(knots, t, d, step_s))
             for t in _GRID_T_S for d in _GRID_DELAY_S
-        )  # fmt: skip
-        tried = [with_best_values(samples, model) for model in first_order]
+        ]  # fmt: skip
         found.append(min(tried, key=lambda pair: pair[1]))
     return [model for model, _ in sorted(found, key=lambda pair: pair[1])]
 
