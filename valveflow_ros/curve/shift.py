@@ -316,7 +316,8 @@ def _judged(
     """Test one piece by the curves and by its segments, whose times are ``time_ns``."""
     common = _common(reference, current.pieces[index])
     if common is None:
-        return PieceShift(*[math.nan] * 10, False, math.nan)
+        unknown: dict[str, Any] = dict.fromkeys(PieceShift.__match_args__, math.nan)
+        return PieceShift(**{**unknown, 'moved': False})
     u = np.linspace(*common, _PROFILE)
     # The end points are left out: after a jump they have the neighbour's value.
     difference = (current.model.static(u) - reference.model.static(u))[1:-1]

@@ -255,7 +255,9 @@ class Predictor(Memory):
         self, time_ns: IntArray, u: FloatArray, scale: FloatArray, power_mw: FloatArray,
         kinds: ByteArray,
     ) -> _Columns:  # fmt: skip
-        out = _Columns(*np.empty((4, len(u))), np.empty(len(u), dtype=np.uint8))
+        static, dynamic, residual, average = np.empty((4, len(u)))
+        state = np.empty(len(u), dtype=np.uint8)
+        out = _Columns(static, dynamic, residual, average, state)
         _predict(time_ns, u, scale, power_mw, kinds, self._filter, out)
         return out
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -134,8 +134,9 @@ class Rows:
 
     def part(self, start: int, end: int) -> Rows:
         """Return the rows ``[start, end)`` without copying."""
-        columns = [getattr(self, field.name) for field in fields(self)]
-        return Rows(*(None if column is None else column[start:end] for column in columns))
+        columns: list[Any] = [getattr(self, field.name) for field in fields(self)]
+        parts: list[Any] = [None if c is None else c[start:end] for c in columns]
+        return Rows(*parts)
 
     @classmethod
     def of(cls, table: SampleTable, exponent: float, correction: Correction | None = None) -> Rows:

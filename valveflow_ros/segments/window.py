@@ -76,8 +76,9 @@ class WindowContents:
 
 
 NO_ROWS = WindowContents(
-    np.empty(0, dtype=np.int64), *np.empty((3, 0)), np.empty((0, 3), dtype=np.int64)
-)
+    np.empty(0, dtype=np.int64), np.empty(0), np.empty(0), np.empty(0),
+    np.empty((0, 3), dtype=np.int64),
+)  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -313,9 +314,12 @@ class RollingWindow:
             if s.first_row >= number[0]
         ]
         command = self._data[4, inside]
+        u, power, temperature = (column[inside].copy() for column in self._data[:3])
         return WindowContents(
             self._time_ns[inside].copy(),
-            *(column[inside].copy() for column in self._data[:3]),
+            u,
+            power,
+            temperature,
             np.array(spans, dtype=np.int64).reshape(-1, 3),
             self._data[3, inside].copy(),
             # Most units do not log the command, and a snapshot is sent to another process.

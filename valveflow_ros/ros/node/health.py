@@ -33,7 +33,6 @@ from valveflow_ros.signals.units import better_units, unit_of
 
 _NO_LEAD = -(2**63)
 _FAR_BEHIND_NS = 120 * NS_PER_S
-_ONE_SERVER = 'set both by one server'
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,11 +274,10 @@ class InputHealth:
             off_ns = self._last_ns[info.signal] - self._newest_ns
             outliers = self._new(info.topic, 'time_outlier', counts['time_outlier'])
             if outliers and abs(off_ns) > self._jump_ns:
-                off, side = (
-                    duration(abs(off_ns) / NS_PER_S),
-                    'ahead of' if off_ns > 0 else 'behind',
-                )
-                return f'The last stamp is {off} {side} the newest one used.'
+                off = duration(abs(off_ns) / NS_PER_S)
+                if off_ns > 0:
+                    return f'The last stamp is {off} ahead of the newest one used.'
+                return f'The last stamp is {off} behind the newest one used.'
             if bad_quality:
                 return (
                     'The sender marked them as bad quality, or does not set '
@@ -317,11 +315,17 @@ class InputHealth:
             return '', ''
         off = duration(abs(lead_ns) / NS_PER_S)
         if lead_ns > 0:
-            return f"Stamps are up to {off} ahead of this machine's clock; {_ONE_SERVER}.", ''
-        behind = f"tamps are {off} behind this machine's clock"
+            return (
+                f"Stamps are up to {off} ahead of this machine's clock; set both by one server.",
+                '',
+            )
         if lead_ns >= -_FAR_BEHIND_NS:
-            return '', f's{behind}'
-        return f'S{behind}; {_ONE_SERVER}, or play a recording with a /clock.', ''
+            return '', f"stamps are {off} behind this machine's clock"
+        return (
+            f"Stamps are {off} behind this machine's clock; set both by one server, or play a "
+            'recording with a /clock.',
+            '',
+        )
 
     def _new(self, topic: str, what: str, count: int) -> int:
         """Return the increase of a count since the last call."""
