@@ -406,13 +406,20 @@ def _with_exponent(
         problem = Problem(coarse.with_exponent(by))
         ar = fit_ar(*problem.answer(model))
         found = covariance_of(problem, model, free, ar, final=False, exponent=True)
-        step, error = found.exponent_step, found.exponent_stderr
-        if not math.isfinite(step) or abs(step) < _EXPONENT_NEAR * error:
+        step, error = found.step, found.exponent_stderr
+        if step is None or abs(step[-1]) < _EXPONENT_NEAR * error:
             break
-        if kept and not by and abs(step) < _EXPONENT_FIRST_Z * error:
+        if kept and not by and abs(step[-1]) < _EXPONENT_FIRST_Z * error:
             return None
-        trial = float(np.clip(by + np.clip(step, -_EXPONENT_MOST, _EXPONENT_MOST), low, high))
-        model = coarse.model_with_exponent(model, trial - by)
+        trial = float(np.clip(by + np.clip(step[-1], -_EXPONENT_MOST, _EXPONENT_MOST), low, high))
+        # Exponent, curve and c are nearly interchangeable: damped steps would move them apart.
+        share = (trial - by) / step[-1]
+        change = share * step[: model.size]
+        change[3 * model.pieces - 1 :][: 2 * model.regions] = 0.0  # of the dynamics
+        moved = model.unpack(model.pack() + change)
+        model = coarse.model_with_exponent(
+            moved if in_bounds(moved, coarse) else model, trial - by
+        )
         model, _ = move(Problem(coarse.with_exponent(trial)), model, ar, free, 3)
         by = trial
     return None if kept and not abs(by) > _EXPONENT_Z * error else (model, by)

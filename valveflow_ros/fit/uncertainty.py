@@ -43,16 +43,18 @@ class Certainty:
     prediction_mw : float
         Error of the prediction due to the errors of the parameters: root mean square of all rows.
         NaN if the fit is not the final one.
-    exponent_step, exponent_stderr : float
-        Change of the exponent of the pressure by one Gauss-Newton step of all parameters, and its
-        standard error; NaN if the exponent is not free.
+    step : float64 (P + 1,), optional
+        Gauss-Newton step of the packed parameters and the exponent of the pressure, without
+        damping, if the exponent is free.
+    exponent_stderr : float
+        Standard error of that exponent.
     """
 
     covariance: FloatArray
     level_stderr: FloatArray
     innovation_mw: float
     prediction_mw: float
-    exponent_step: float = math.nan
+    step: FloatArray | None = None
     exponent_stderr: float = math.nan
 
 
@@ -106,7 +108,7 @@ def covariance_of(
         errors[packed : packed + levels],
         float(np.sqrt(max(variance, 0.0))),
         _prediction_error(jacobian, weight, known) if final else math.nan,
-        float(inverse[-1] @ sums[:-1, -1]) if exponent and moved[-1] else math.nan,
+        _full_step(inverse @ sums[:-1, -1], moved) if exponent and moved[-1] else None,
         float(errors[-1]) if exponent else math.nan,
     )
 
@@ -122,6 +124,12 @@ def _blocks(problem: Problem) -> int:
     """Return the number of time blocks into which the window is divided."""
     rows = max(1, round(_LEAST_IN_BLOCK_S / (problem.samples.step_s * problem.samples.group)))
     return max(1, min(_MOST_BLOCKS, problem.samples.means // rows))
+
+
+def _full_step(step: FloatArray, moved: BoolArray) -> FloatArray:
+    out = np.zeros(len(moved))
+    out[moved] = step
+    return out
 
 
 def _exponent_tangent(problem: Problem, model: RegionalModel, column: FloatArray) -> None:
