@@ -58,6 +58,7 @@ def test_a_run_from_the_plant_to_the_disk(
         )
     finally:
         os.umask(before)
+        del ros_environment['ROS_LOG_DIR']  # the plant's log is not the monitor's
     plant = start_plant(processes, days=DAYS, use_clock=True, command=True, effects=f'"{FAULT}"')
     live_parameter_and_acknowledgement(listener, monitor)
     nobody_else_is_listened_to(monitor, int(ros_environment['ROS_DOMAIN_ID']))
