@@ -135,7 +135,7 @@ def test_with_a_position_sizes_are_told(loop, frame, tmp_path):
         (lambda f: f[:199], 'There are 199 rows'),
         (lambda f: f.assign(**{'FIC101.MV': 50.0}), 'The command hardly moves'),
         (lambda f: f.assign(**{'FIC101.PV': 'Bad Input'}), 'There are 0 rows'),
-        (lambda f: f.assign(**{'FIC101.PV': 7.5}), 'The process value stands still'),
+        (lambda f: f.assign(**{'FIC101.PV': 7.5}), 'The process value does not move'),
     ],
 )
 def test_what_cannot_be_judged_is_a_result(loop, frame, change, words):

@@ -139,8 +139,11 @@ def test_a_long_record_is_judged_in_parts():
         (lambda c, y: (c[:0], y[:0]), 'There are 0 rows'),
         (lambda c, y: (c * np.nan, y), 'There are 0 rows'),
         (lambda c, y: (c * 0 + 50, y), 'The command hardly moves'),
-        (lambda c, y: (c, y * 0), 'The process value stands still'),
-        (lambda c, y: (c, np.where(np.arange(len(y)) < 500, 1.0, y)), 'The process value stands'),
+        (lambda c, y: (c, y * 0), 'The process value does not move'),
+        (
+            lambda c, y: (c, np.where(np.arange(len(y)) < 500, 1.0, y)),
+            'The process value has the same',
+        ),
         (lambda c, y: (np.minimum(c, 51.0), y), 'The command rests at its end'),
         (lambda c, y: (np.linspace(0, 9, len(c)) + 0.01 * np.sin(c), y), 'The '),
         (lambda c, y: (c, np.random.default_rng(0).normal(size=len(y))), 'The process value does'),
@@ -225,7 +228,7 @@ def test_a_position_that_stands_is_no_sound_valve():
     dead = judge_position(command, np.full(700, 31.0), STEP_S)
     stuck = judge_position(command, 31 + 0.01 * np.random.default_rng(1).normal(size=700), STEP_S)
     assert dead.verdict == stuck.verdict == NOT_JUDGED
-    assert 'stands still' in dead.reason
+    assert 'does not move' in dead.reason
     assert 'hardly follows' in stuck.reason
 
 

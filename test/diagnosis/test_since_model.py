@@ -131,5 +131,5 @@ def test_a_diagnosis_compares_with_the_model_as_it_is_given(model):
 def test_a_change_within_three_of_its_errors_is_not_named(model):
     told = since(scaled_opening(1.004), model)
     assert isinstance(told, str)
-    assert 'cannot be told' in told
+    assert 'cannot be distinguished' in told
     assert since(scaled_opening(1.02), model).name == 'input_change'
