@@ -67,7 +67,7 @@ def test_the_window_is_diagnosed_as_the_record_is() -> None:
         [(task.contents.time_ns[a], task.contents.time_ns[b - 1])
          for a, b, _ in task.contents.spans]
     )  # fmt: skip
-    record = Record(samples, STEP_S, StaticForm(exponent=EXPONENT), Settings().settle_s, spans)
+    record = Record(samples, STEP_S, curve.static_form, Settings().settle_s, spans)
     truth = to_json(diagnose(record, curve.model))
     content = json.loads(found.text)
     assert found.window_end_ns == task.window_end_ns
