@@ -19,7 +19,7 @@ from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.segments.window import WindowContents
-from valveflow_ros.signals.static_form import StaticForm, integrated_input
+from valveflow_ros.signals.static_form import integrated_input
 
 
 def contents_of(samples: SampleTable) -> WindowContents:

@@ -78,14 +78,15 @@ def keys(name: str) -> list[str]:
     return {'clock': ['time'], 'reheater': ['', 'time'], 'region_lag': ['time', '', '']}[name]
 
 
-def test_a_compressed_log_hides_half_its_interval(grids: Grids) -> None:
+def test_a_compressed_log_hides_its_interval_and_half_of_it_of_a_clock(grids: Grids) -> None:
     held = replace(grids, blur=blur_of(grids.v, 10.0, compression(54.0)))
-    assert held.blur.time_s == 27.0
+    assert (held.blur.time_s, held.blur.least_s('clock')) == (54.0, 27.0)
+    assert hidden(FittedCause(catalogue()['reheater'], (0.3, 50.0)), held) != ''
     assert held.blur.opening_percent >= 2.0
     why = hidden(FittedCause(catalogue()['clock'], (26.0,)), held)
     assert why == (
-        'cannot be judged: values of this compressed log are typically 54 s apart, which hides '
-        'lags and delays below 27 s'
+        'cannot be judged: values of the power in this compressed log are typically 54 s apart, '
+        'which hides lags and delays below 27 s'
     )
     assert hidden(FittedCause(catalogue()['clock'], (28.0,)), held) == ''
     assert 'compressed' in actuator.hindered(replace(held, command=held.v + 1.0))

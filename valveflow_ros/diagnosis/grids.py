@@ -75,6 +75,10 @@ class Blur:
     words: str = ''
     compressed: bool = False
 
+    def least_s(self, name: str) -> float:
+        """Return the least time of a cause that can be judged; that of a clock needs half."""
+        return 0.5 * self.time_s if self.compressed and name == 'clock' else self.time_s
+
 
 @dataclass(frozen=True, slots=True)
 class Covariate:

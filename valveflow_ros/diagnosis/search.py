@@ -450,7 +450,7 @@ def hidden(added: FittedCause, grids: Grids) -> str:
     elif added.name == 'rate_limit':
         seen = blur.opening_percent >= blur.time_s * values['r_percent_per_s']
     else:
-        seen = added.name not in _TIMES or values[_TIMES[added.name]] >= blur.time_s
+        seen = added.name not in _TIMES or values[_TIMES[added.name]] >= blur.least_s(added.name)
     return '' if seen else unseen(added.name, grids)
 
 
@@ -461,7 +461,7 @@ def unseen(name: str, grids: Grids) -> str:
         return ''
     if name in _SLACKS:
         return f'{blur.words} a slack below {blur.opening_percent:.2g} % of opening'
-    return f'{blur.words} lags and delays below {blur.time_s:.0f} s'
+    return f'{blur.words} lags and delays below {blur.least_s(name):.0f} s'
 
 
 def _take(found: SearchResult, rival: Rival, gain: float) -> None:
