@@ -167,8 +167,8 @@ def test_without_the_column_a_drift_is_told(plant, without):
     told = f'The power varies slowly over days, by about {slow.drift_mw:.2g} MW on average, '
     assert told in without.sentence
     if without.verdict == 'nothing':
-        assert 'down to a slow disturbance and its noise' in without.sentence
-    assert 'down to its noise' not in without.sentence
+        assert 'is a slow disturbance and noise' in without.sentence
+    assert 'measurement is noise' not in without.sentence
     assert to_json(without)['disturbance']['drift_mw'] == slow.drift_mw
     assert not {'diurnal', 'gain_drift', 'output_offset_drift'} & {c.name for c in without.causes}
 
