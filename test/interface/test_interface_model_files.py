@@ -305,7 +305,7 @@ def truth_answers(truth: Truth) -> None:
 def truth_can_be(raw: dict[str, Any]) -> bool:
     more = {'slope_stderr': None, 'intercept_stderr': None, 'samples': 0}
     pieces = [{**piece, **more} for piece in raw['pieces']]
-    return number(raw['pressure_exponent'], 0.5, 2) and all(map(piece_can_be, pieces))
+    return number(raw.get('pressure_exponent', 1.125), 0.5, 2) and all(map(piece_can_be, pieces))
 
 
 TRUTH = {
