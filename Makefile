@@ -92,7 +92,7 @@ torture: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) for recording in '1s --seeds 30' 'compressed --seeds 30' 'minute --seeds 100'; do \
+	@$(ENV) for recording in '1s --seeds 30' 'compressed --seeds 30' 'minute --seeds 30'; do \
 	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input --first 701 \
 	  --recording $$recording || exit 1; done
 
