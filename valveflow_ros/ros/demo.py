@@ -306,7 +306,7 @@ class Watch(Node):
         self.acknowledged += int(response is not None and response.success)
 
 
-def _run(options: argparse.Namespace, stop: StopFlag) -> int:
+def _show(options: argparse.Namespace, stop: StopFlag) -> int:
     folder: Path = options.output.resolve()
     fault_ns = DEFAULT_START_NS + round(_FAULT_FROM * options.days * 24 * _HOUR_NS)
     story = Story(fault_ns)
@@ -497,7 +497,7 @@ def main(args: Sequence[str] | None = None) -> int:
     def work() -> int:
         try:
             options.output.mkdir(parents=True, exist_ok=True)
-            return _run(options, stop)
+            return _show(options, stop)
         except OSError as error:
             place = error.filename or options.output
             raise ValveflowError(f'{place}: {error.strerror}') from None
