@@ -222,3 +222,11 @@ def test_the_finder_of_circles_catches(b, caught, house):
     house('fit/b.py', b)
     house('curve/c.py', '')
     assert bool(circles()) is caught
+
+
+def test_no_name_is_defined_twice_in_a_module():
+    """The first of two functions of one name would never run."""
+    for path in HOUSE.rglob('*.py'):
+        body = ast.parse(path.read_text(encoding='utf-8')).body
+        names = [n.name for n in body if isinstance(n, ast.FunctionDef | ast.ClassDef)]
+        assert len(names) == len(set(names)), path
