@@ -71,8 +71,8 @@ def covariance_of(
     The inverse normal matrix is widened if sums of scores over blocks vary more than with
     independent innovations. In the final fit, and for an ``exponent`` of the pressure that is
     free, long blocks count too. Levels and exponent are parameters with derivatives by
-    differences. The exponent changes the curve at no pressure but the others than the median one:
-    the errors of slopes are those at the median pressure.
+    differences. The curve at the median pressure does not depend on the exponent, so the errors
+    of slopes are those at the median pressure.
     """
     packed, levels = len(free), len(model.levels) if final else 0
     residual, jacobian, weight = problem.tangents(model, also=levels + exponent)
