@@ -60,6 +60,12 @@ class RegionalModel:
         return 3 * self.pieces - 1 + 2 * self.regions + (self.offset_mw is not None)
 
     @property
+    def dynamic_places(self) -> slice:
+        """Return the positions of ln T and the delays among the packed parameters."""
+        first = 3 * self.pieces - 1
+        return slice(first, first + 2 * self.regions)
+
+    @property
     def delay_places(self) -> slice:
         """Return the positions of the delays among the packed parameters."""
         first = 3 * self.pieces - 1 + self.regions

@@ -90,6 +90,11 @@ class Samples:
         """Return the same rows with little averaging, for the last fit of all parameters."""
         return replace(self, group=max(1, min(self.group, round(_FINE_S / self.step_s))))
 
+    def slower(self, mean_s: float) -> Samples:
+        """Return the rows of `coarser`, scored as means over about ``mean_s``."""
+        rows = self.coarser()
+        return replace(rows, group=max(rows.group, round(mean_s / rows.step_s)))
+
     def coarser(self) -> Samples:
         """Return means over several rows, for searches; a scored mean then has two rows.
 

@@ -8,7 +8,8 @@ exact partition is the start. Curve and regional dynamics are then fitted
 together by the prediction error on all samples, whitened by an AR model of
 the residual (the noise of the power is far from white). The regions are first
 found on a grid. Their boundaries are found by line searches, since the cost is
-not smooth in them; all other parameters by Levenberg-Marquardt.
+not smooth in them; all other parameters by Levenberg-Marquardt. If another
+curve fits means over ten minutes clearly better, it is taken.
 """
 
 from __future__ import annotations
@@ -236,6 +237,14 @@ _EXPONENT_ROUNDS, _EXPONENT_MOST, _EXPONENT_NEAR = 5, 0.05, 0.2
 _EXPONENT_Z, _EXPONENT_FIRST_Z = 4.0, 1.5
 _EXPONENT_FAR = 0.01
 _NARROWEST = 0.01  # of the range of u: narrower pieces are joined before the search
+# One lag describes fast movements only roughly, and the load controller answers the power within a
+# row. If the noise is slow, the fit rests on fast movements, and both bend the curve; means over
+# this time are free of that. They contain less about a plant whose fast movements fit as well, so
+# they must gain this log-likelihood. Of 20 plants with one lag none gained more than 4.
+_LONG_S, _LONG_GAIN = 600.0, 15.0
+_LONG_LEAST_MW = 0.03  # the averaged rows are not more exact than this
+_LONG_EACH = 10  # at least so many means for each parameter,
+_LONG_SHARE = 0.75  # and with so much of the rows: gaps cost a mean each
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +272,8 @@ class Refined:
         sd of the residual of single rows.
     confidence : dict
         Probability of each number of pieces; empty when it was given.
+    long_s : float
+        Length of the means to which the curve was fitted, 0 if the last fit was to all rows.
     exponent_moved, exponent_stderr : float
         Change of the exponent of the pressure from its start, and its standard error, NaN if it
         was not free.
@@ -279,6 +290,7 @@ class Refined:
     weight: ByteArray
     row_sd_mw: float
     confidence: dict[int, float] = field(default_factory=dict)
+    long_s: float = 0.0
     exponent_moved: float = 0.0
     exponent_stderr: float = math.nan
 
@@ -336,10 +348,61 @@ def refine(
     if jumps.any():
         model, cost = move(fine, model, ar, free, 4)
     model = corrected(samples, fine, model, ar, free)
-    found = _conclude(problem, fine, model, free, ar, fitted)
+    long = _long_means(samples, fine, model, free)
+    if long is not None:
+        start_exponent = exponent + moved if fitted and exponent is not None else None
+        model, by, long = _fitted_to(long, model, free, start_exponent)
+        if by:
+            moved, samples = moved + by, samples.with_exponent(by)
+            problem, fine = Problem(samples), Problem(samples.finer())
+    found = _conclude(problem, fine, model, free, ar, fitted, long)
     return replace(
         found, confidence=shifted(likely, model.pieces - searched), exponent_moved=moved
     )
+
+
+def _long_means(
+    samples: Samples, fine: Problem, model: RegionalModel, free: BoolArray
+) -> Samples | None:
+    """Return the rows as long means, if there are enough and another curve fits them better."""
+    rows = int(fine.answer(model)[1].sum()) * fine.samples.group * fine.samples.step_s
+    length = _LONG_S
+    while length > 2.0 * samples.step_s:
+        long = samples.slower(length)
+        problem = Problem(long)
+        means = int(problem.answer(model)[1].sum())
+        if means >= _LONG_EACH * free.sum() and means * length >= _LONG_SHARE * rows:
+            before, weight = problem.answer(model)
+            ar = fit_ar(before, weight)
+            trial, _ = move(problem, model, ar, _of_curve(model, free), 3)
+            change = (problem.answer(trial)[0] - before)[weight > 0]
+            other = np.sqrt(np.mean(change**2)) > _LONG_LEAST_MW * problem.size
+            return long if other and problem.gain(model, trial, ar) > _LONG_GAIN else None
+        length /= 2.0
+    return None
+
+
+def _fitted_to(
+    long: Samples, model: RegionalModel, free: BoolArray, exponent: float | None
+) -> tuple[RegionalModel, float, Samples]:
+    """Fit the curve, and the exponent if it is free, to long means; return also its change."""
+    curve, by = _of_curve(model, free), 0.0
+    if exponent is not None:
+        found = _with_exponent(long, model, exponent, False, curve)
+        assert found is not None
+        model, by = found
+        long = long.with_exponent(by)
+    problem = Problem(long)
+    for _ in range(2):
+        model, _ = move(problem, model, fit_ar(*problem.answer(model)), curve, 3)
+    return model, by, long
+
+
+def _of_curve(model: RegionalModel, free: BoolArray) -> BoolArray:
+    """Return the free parameters without those of the dynamics."""
+    curve = free.copy()
+    curve[model.dynamic_places] = False
+    return curve
 
 
 def search(
@@ -382,7 +445,7 @@ def _outlined(
     model, likely = _search(Problem(coarse), _join(start), most_pieces)
     if exponent is None or samples.pressure_mpa is None:
         return model, likely, 0.0, False
-    found = _with_exponent(coarse, model, exponent, exponent == usual)
+    found = _with_exponent(coarse, model, exponent, exponent == usual, free_parameters(model))
     if found is None:
         return model, likely, 0.0, False
     model, moved = found
@@ -394,16 +457,16 @@ def _outlined(
 
 
 def _with_exponent(
-    coarse: Samples, model: RegionalModel, exponent: float, kept: bool
+    rows: Samples, model: RegionalModel, exponent: float, kept: bool, free: BoolArray
 ) -> tuple[RegionalModel, float] | None:
     """Return a model with the exponent that fits best, and the change of the exponent.
 
     None if the exponent is to be ``kept`` unless another one is clearly better, and none is.
     """
-    free, by, error = free_parameters(model), 0.0, math.nan
+    by, error = 0.0, math.nan
     low, high = (limit - exponent for limit in exponents_near(exponent))
     for _ in range(_EXPONENT_ROUNDS):
-        problem = Problem(coarse.with_exponent(by))
+        problem = Problem(rows.with_exponent(by))
         ar = fit_ar(*problem.answer(model))
         found = covariance_of(problem, model, free, ar, final=False, exponent=True)
         step, error = found.step, found.exponent_stderr
@@ -415,12 +478,10 @@ def _with_exponent(
         # Exponent, curve and c are nearly interchangeable: damped steps would move them apart.
         share = (trial - by) / step[-1]
         change = share * step[: model.size]
-        change[3 * model.pieces - 1 :][: 2 * model.regions] = 0.0  # of the dynamics
+        change[model.dynamic_places] = 0.0
         moved = model.unpack(model.pack() + change)
-        model = coarse.model_with_exponent(
-            moved if in_bounds(moved, coarse) else model, trial - by
-        )
-        model, _ = move(Problem(coarse.with_exponent(trial)), model, ar, free, 3)
+        model = rows.model_with_exponent(moved if in_bounds(moved, rows) else model, trial - by)
+        model, _ = move(Problem(rows.with_exponent(trial)), model, ar, free, 3)
         by = trial
     return None if kept and not abs(by) > _EXPONENT_Z * error else (model, by)
 
@@ -463,14 +524,24 @@ def _join(model: RegionalModel) -> RegionalModel:
 
 def _conclude(
     problem: Problem, fine: Problem, model: RegionalModel, free: BoolArray, ar: FloatArray,
-    exponent: bool,
+    exponent: bool, long: Samples | None,
 ) -> Refined:  # fmt: skip
     """Add the residual and the uncertainty of the parameters."""
     certainty = covariance_of(fine, model, free, ar, exponent=exponent)
+    if long is not None:
+        slow, curve = Problem(long), _of_curve(model, free)
+        own = covariance_of(slow, model, curve, fit_ar(*slow.answer(model)), exponent=exponent)
+        covariance, dynamic = own.covariance.copy(), model.dynamic_places
+        covariance[dynamic, dynamic] = certainty.covariance[dynamic, dynamic]
+        certainty = replace(
+            certainty, covariance=covariance, prediction_mw=own.prediction_mw,
+            exponent_stderr=own.exponent_stderr,
+        )  # fmt: skip
     residual, weight = problem.answer(model)
     return Refined(
         model, certainty.covariance, certainty.level_stderr, free, ar, certainty.innovation_mw,
         certainty.prediction_mw, residual, weight, _row_sd(fine, model),
+        long_s=0.0 if long is None else long.group * long.step_s,
         exponent_stderr=certainty.exponent_stderr,
     )  # fmt: skip
 

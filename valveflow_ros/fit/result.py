@@ -144,7 +144,7 @@ def from_refined(
         breakpoint_intervals=intervals,
         dynamics=dynamics,
         offset_mw=m.offset,
-        notes=(*static.notes, *_form_errors(static, result)),
+        notes=(*static.notes, *_form_errors(static, result), *_long_means(result)),
         pressure_scale_exponent=static.pressure_scale_exponent
         + (result.exponent_moved if static.axis == OPENING else 0.0),
         residuals=residual_statistics(
@@ -171,6 +171,16 @@ def _form_errors(static: Characteristic, result: Refined) -> tuple[str, ...]:
     return (
         f'{said}{m:.3f} ± {_Z95 * result.exponent_stderr:.3f}; '
         f'the power without flow is c = {result.model.offset:.1f} ± {error:.1f} MW.',
+    )
+
+
+def _long_means(result: Refined) -> tuple[str, ...]:
+    """Return a note if the curve was fitted to long means."""
+    if not result.long_s:
+        return ()
+    return (
+        f'The curve was fitted to means over {result.long_s / 60.0:.3g} min: fast movements would '
+        'give another curve, because one lag does not describe them well enough.',
     )
 
 
