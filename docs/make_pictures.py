@@ -49,6 +49,11 @@ def _save(figure: Any, name: str) -> Path:
     return path
 
 
+def _legend(axis: Any, columns: int) -> None:
+    """Put the legend above the axes, where it hides no data."""
+    axis.legend(loc='lower center', bbox_to_anchor=(0.5, 1.0), ncols=columns, columnspacing=1.2)
+
+
 def _binned(axis: Any, variable: str, view: dict[str, list[float]]) -> None:
     label, scale = _AXES[variable]
     x = scale * np.array(view['middle'])
@@ -104,8 +109,7 @@ def effect(name: str) -> Path:
             _moves(axis, views[variable])
         else:
             _binned(axis, variable, views[variable])
-        axis.margins(y=0.28)
-        axis.legend(loc='best', ncols=2 if variable == 'fast moves' else 1)
+        _legend(axis, 2 if variable == 'fast moves' else 3)
     axes[0].set_ylabel('measured − simulated (MW)')
     figure.suptitle(f'{name}: {data["parameters"].replace(",", ", ")}', fontsize=11)
     figure.tight_layout()
@@ -119,7 +123,7 @@ def _record(name: str, view: dict[str, Any]) -> Path:
     axis.plot(minutes, view['true'], '-', color=EXTENDED, lw=1.0, alpha=0.8, label='the plant')
     axis.set_xlabel('minutes')
     axis.set_ylabel(f'{view["signal"].replace("_", " ")} ({view["unit"]})')
-    axis.legend(loc='best', ncols=2)
+    _legend(axis, 2)
     figure.suptitle(f'{name}: {CASES[name].parameters.replace(",", ", ")}', fontsize=11)
     figure.tight_layout()
     return _save(figure, name)

@@ -307,17 +307,17 @@ def results() -> str:
          f'error {min(medians):.2f} to {max(medians):.2f} MW in the median, '
          f'{max(e["largest"] for e in errors):.2f} MW at most; {_slopes(thermal)} % of the '
          '95 % intervals of slopes contain the true value'),
-        ('false alarms on healthy units, 20 days each',
-         f'{healthy["paper"]["alarms"]} in {20 * healthy["paper"]["units"]} days on the plant '
-         f'of the paper, {_total(physics, "alarms")} in {20 * _total(physics, "units")} days on '
-         'units built from physics'),
-        ('an effect of three times its default size begins on day 10',
-         f'an alarm in {found} of {tried} runs; on day 20 it is still active in {stood}'),
-        ("one hidden effect in plants of the paper's kind, 2 to 3 times the detection limit",
-         f'named, and no other, in {hidden["right"]} of {hidden["records"]}; another name '
-         f'with confidence in {hidden["named_with_confidence_wrongly"]}'),
-        ("healthy plants of the paper's kind, five days",
-         f'nothing named in {null["right"]} of {null["records"]}'),
+        ('alarms in 20 days: healthy units, and units in which an effect of three times its '
+         'default size begins on day 10',
+         f'{healthy["paper"]["alarms"]} false ones in {20 * healthy["paper"]["units"]} days on '
+         f'the plant of the paper, {_total(physics, "alarms")} in '
+         f'{20 * _total(physics, "units")} days on units built from physics; the effect raised '
+         f'one in {found} of {tried} runs, still active on day 20 in {stood}'),
+        ("plants of the paper's kind, five days: healthy, and with one hidden effect of 2 to 3 "
+         'times the detection limit',
+         f'nothing named in {null["right"]} of {null["records"]}; the effect named, and no '
+         f'other, in {hidden["right"]} of {hidden["records"]}, another name with confidence in '
+         f'{hidden["named_with_confidence_wrongly"]}'),
         ('units built from physics, with an effect or healthy: [a benchmark](docs/naming.md)',
          f'right answers in {_total(named, "right")} of {_total(named, "records")}, a wrong or '
          f'further name in {_total(named, "wrong")}'),

@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import json
 import unicodedata
+import zoneinfo
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,21 @@ def test_nothing_of_others_commands_the_terminal(word):
         assert not set(told) & set('\u2028\u2029\u202a\u202e\u2066\u2069')
         if as_json:
             assert json.loads(out.getvalue()) == {word: [word]}
+
+
+def test_times_are_told_in_the_zone_and_json_keeps_utc():
+    said = 'Since 2024-01-02 00:30 UTC.'
+    for as_json, told in ((False, 'Since 2024-01-02 01:30 CET.'), (True, said)):
+        out, err = io.StringIO(), Terminal()
+        console = Console(out, err, as_json=as_json)
+        console.times_in(zoneinfo.ZoneInfo('Europe/Berlin'))
+        console(0.5, said)
+        for tell in (console.say, console.warn, console.fail):
+            tell(said)
+        console.finish(VerbResult(said, {'since': said}))
+        assert told in out.getvalue()
+        assert 'UTC' not in err.getvalue()
+        assert err.getvalue().count('01:30 CET') >= 4
 
 
 def test_a_picture_keeps_its_colours():

@@ -48,13 +48,15 @@ def last_command(text):
 
 def test_everything_comes_together_and_the_last_line_works(run, table, tmp_path):
     log = tmp_path / 'x.mcap'
+    by_identify = run('identify', table, '-o', tmp_path / 'result').refused()
     said = run('import', table, '-o', log).refused()
-    assert ': 5 things are open' in said
-    for option in ('--date-order dmy', "'valve_opening=Valve position:fraction'",
-                   "'main_steam_pressure=Steam press:bar'",
-                   "'main_steam_temperature=Steam temp:K'",
-                   "'generated_power=Gross MW:kW'"):  # fmt: skip
-        assert said.count(option) == 2, option
+    for refusal in (by_identify, said):
+        assert ': 5 things are open' in refusal
+        for option in ('--date-order dmy', "'valve_opening=Valve position:fraction'",
+                       "'main_steam_pressure=Steam press:bar'",
+                       "'main_steam_temperature=Steam temp:K'",
+                       "'generated_power=Gross MW:kW'"):  # fmt: skip
+            assert refusal.count(option) == 2, option
     assert not log.exists()
     ran = run(*last_command(said)).done()
     assert 'Warning' not in ran.err

@@ -12,7 +12,7 @@ import pytest
 from alarm_story import NERVOUS, SlowLife, held_in, lived, restored
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import START_NS, blocks_of, cuts, examples
+from streams import START_NS, blocks_of, cuts, examples, grid_ns
 
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import AlarmAction
@@ -242,6 +242,17 @@ def test_where_the_residual_is_gone_it_still_says_how_far_it_was(share, words):
         f'The unit gave {words} than its valve curve (mean over the loads seen). '
         in again.sentence
     )
+
+
+def test_the_sentence_names_the_opening_at_which_the_alarm_was_raised():
+    settings = Settings(NERVOUS)
+    alarm, shares = ResidualAlarm(settings), np.array([0.0, 1.5, 1.5])
+    time_ns, opening = grid_ns(3, start_ns=START_NS), np.array([70.0, 86.3, 90.0])
+    ((_, raised),) = alarm.feed(time_ns, shares, 3.0 * shares, 'm', opening_percent=opening)
+    assert raised.sentence.endswith(' The alarm was raised at 86 % opening.')
+    other = restored(alarm, settings)
+    (acknowledged,) = other.operate(AlarmAction.ACKNOWLEDGE, int(time_ns[-1]), 'm')[1]
+    assert acknowledged.sentence.endswith(' The alarm was raised at 86 % opening.')
 
 
 def test_what_does_not_fit_is_not_restored():

@@ -129,9 +129,12 @@ def test_hours_without_a_sample_are_a_gap():
     for k in range(7200, 7330):
         predict(unit, k)
     (found,) = shown_now(unit).units
-    *_, measured = day_picture(found)['data']
+    band, *_, measured = day_picture(found)['data']
     assert measured['y'].count(None) == 1
     assert len(measured['y']) == 6
+    # Two outlines: the band does not run through the gap.
+    assert len(band['y']) == 2 * 5 + 1
+    assert band['x'].count(None) == band['y'].count(None) == 1
 
 
 REFUSED = {

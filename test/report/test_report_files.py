@@ -19,6 +19,7 @@ import pytest
 from report_stories import START_NS, diagnosed, history
 
 from valveflow_ros.errors import InputError
+from valveflow_ros.interface.files import check_results
 from valveflow_ros.report import drawing, first_run
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.drawing import figure_files
@@ -57,6 +58,17 @@ def test_without_matplotlib_one_sentence_says_what_to_do(figures, monkeypatch):
     monkeypatch.setattr(drawing, 'find_spec', lambda name: None)
     with pytest.raises(InputError, match='pip install matplotlib'):
         figure_files(figures['curve'])
+
+
+def test_a_matplotlib_that_cannot_be_loaded_is_refused_before_any_work(monkeypatch, tmp_path):
+    pytest.importorskip('matplotlib')
+
+    def broken(name):
+        raise ImportError('libfreetype.so.6: cannot open shared object file')
+
+    monkeypatch.setattr(drawing, 'import_module', broken)
+    with pytest.raises(InputError, match=r'cannot be loaded \(libfreetype.*--force-reinstall'):
+        check_results(tmp_path / 'result', figures=True, tables=False)
 
 
 def test_the_table_of_the_curve_has_its_ends_and_the_cloud(figures, identified):

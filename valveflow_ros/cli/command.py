@@ -121,31 +121,36 @@ class Console(Progress):
         self._as_json = as_json
         self._quiet = quiet
         self._unit = 'MW'
+        self._zone: tzinfo | None = None
         bar = err.isatty() and os.environ.get('TERM') != 'dumb'
         self._line = ProgressLine(err, bar, lambda told, what: share_of_time(verb, told, what))
 
     def __call__(self, share: float, what: str) -> None:
         """Show the progress: a bar on a terminal, otherwise a line if the work takes long."""
         if not self._quiet:
-            self._line.at(share, _harmless(what))
+            self._line.at(share, _harmless(self._local(what)))
 
     def measured_in(self, unit: str) -> None:
         """Print all further texts for an output in this unit."""
         self._unit = unit
 
+    def times_in(self, zone: tzinfo | None) -> None:
+        """Print times in this zone from now on; JSON keeps UTC."""
+        self._zone = zone
+
     def say(self, sentence: str) -> None:
         """Print an informative message."""
         if not self._quiet:
-            self._line.write(_harmless(self._told(sentence)))
+            self._line.write(_harmless(self._local(self._told(sentence))))
 
     def warn(self, sentence: str) -> None:
         """Print a warning."""
-        self._line.write(_harmless(f'Warning: {self._told(sentence)}'))
+        self._line.write(_harmless(f'Warning: {self._local(self._told(sentence))}'))
 
     def fail(self, sentence: str) -> None:
         """Print why the command failed."""
         self._line.end()
-        self._line.write(_harmless(f'valveflow: {self._told(sentence)}'))
+        self._line.write(_harmless(f'valveflow: {self._local(self._told(sentence))}'))
 
     def finish(self, outcome: VerbResult) -> None:
         """Print the result."""
@@ -155,7 +160,8 @@ class Console(Progress):
             text = self._told(text)
             self._out.write(_COMMANDS.sub(lambda c: f'\\u{ord(c[0]):04x}', text) + '\n')
         elif outcome.text:
-            text = outcome.text if outcome.drawn else _harmless(self._told(outcome.text))
+            told = self._local(self._told(outcome.text))
+            text = outcome.text if outcome.drawn else _harmless(told)
             self._out.write(text.rstrip('\n') + '\n')
         self._out.flush()
 
@@ -165,6 +171,13 @@ class Console(Progress):
         from valveflow_ros.signals.units import in_unit
 
         return in_unit(text, self._unit)
+
+    def _local(self, text: str) -> str:
+        if self._zone is None:
+            return text
+        from valveflow_ros.report.words import in_zone
+
+        return in_zone(text, self._zone)
 
 
 def _harmless(text: str) -> str:
@@ -282,6 +295,18 @@ def mapping_of(options: Namespace) -> LogMapping:
     return read_mapping(columns, options.constant, **table_words(options.column))
 
 
+def zone_in(options: Namespace) -> tzinfo | None:
+    """Return the zone of ``--time-zone`` among the options of `add_table`; None for UTC."""
+    gathered = [*getattr(options, 'column', ()), *getattr(options, 'said', ())]
+    words = table_words(gathered)
+    if not words.get('time_zone'):
+        return None
+    from valveflow_ros.interface.mapping import table_options
+    from valveflow_ros.records import zone_of
+
+    return zone_of(table_options(words).time_zone)
+
+
 def table_words(gathered: Sequence[str | TableOption]) -> dict[str, str]:
     """Return the options collected by `add_table`, by the names of `table_options`."""
     return {o.option.replace('-', '_'): o.value for o in gathered if isinstance(o, TableOption)}
@@ -367,14 +392,10 @@ def write_results(
     result: Result, options: Namespace, text: str, data: Mapping[str, Any]
 ) -> VerbResult:
     """Write the files of a result; return its text and data with the list of the files."""
-    from valveflow_ros.records import zone_of
-    from valveflow_ros.report.words import in_zone
-
-    zone = mapping_of(options).table.time_zone
     done = result.write(
-        options.output, figures=options.figures, tables=options.table, time_zone=zone
-    )
-    text = in_zone(text, zone_of(zone))
+        options.output, figures=options.figures, tables=options.table,
+        time_zone=mapping_of(options).table.time_zone,
+    )  # fmt: skip
     files = {'files': {name: str(path) for name, path in done.files.items()}}
     kept = {'kept': dict(done.kept)} if done.kept else {}
     return VerbResult('\n'.join([text, *done.words]), {**data, **files, **kept})

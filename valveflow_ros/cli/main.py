@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, Protocol, cast
 
-from valveflow_ros.cli.command import Console, VerbResult
+from valveflow_ros.cli.command import Console, VerbResult, zone_in
 from valveflow_ros.errors import (
     LOADING_BYTES,
     UsageError,
@@ -312,6 +312,7 @@ def _command(words: list[str], console: Console) -> int:
     except SystemExit as done:  # --help
         sys.stdout.flush()
         return int(done.code or DONE)
+    console.times_in(zone_in(options))
     # watch waits for missing paths and reports them itself.
     if words[0] != 'watch':
         check_paths(parser, options)

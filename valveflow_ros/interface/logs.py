@@ -289,9 +289,9 @@ def open_log(
             lambda names: read_file(path, columns=names, absent=absent, table=said.table)
         )
 
-    def again(said: LogMapping) -> LogContents:
+    def again(said: LogMapping) -> Log:
         progress(0.02, LOOKING_ON)
-        return look(said)
+        return _understood('', look(said), said, SILENT, strict=True)
 
     contents = gather_refusals(path, look, mapping, again)
     name = path.resolve().name if path.name in ('', '..') else path.name
@@ -428,7 +428,9 @@ def steps_of(parts: dict[int, Readings]) -> dict[Signal, float]:
     return steps
 
 
-def _understood(name: str, contents: LogContents, mapping: LogMapping, progress: Progress) -> Log:
+def _understood(
+    name: str, contents: LogContents, mapping: LogMapping, progress: Progress, strict: bool = False
+) -> Log:
     for sentence in contents.warnings:
         progress.warn(sentence)
     for sentence in contents.understood:
@@ -451,7 +453,9 @@ def _understood(name: str, contents: LogContents, mapping: LogMapping, progress:
         for s in measured_signals
     )
     doubts = [found for found in judged if found is not None]
-    plausibility.refuse_guesses(contents.path, doubts, contents.grounds, contents.signals)
+    plausibility.refuse_guesses(
+        contents.path, doubts, contents.grounds, mapping.unsaid(units), contents.signals, strict
+    )
     if not contents.topics:  # a table
         plausibility.refuse_impossible(contents.path, doubts, contents.signals)
     for found in doubts:

@@ -90,6 +90,11 @@ class LogMapping:
         """
         return {c.name: c.theirs if c.known else c.whole for c in self.columns.values()}
 
+    def unsaid(self, signals: Iterable[Signal]) -> set[Signal]:
+        """Return those of the signals whose unit the user did not give with ``--column``."""
+        said = {c.name for c in self.columns.values() if c.unit}
+        return {signal for signal in signals if SIGNALS[signal].topic not in said}
+
     def open_with(self, look: Callable[[dict[str, str]], Answer]) -> Answer:
         """Return ``look(names)``; if it fails, `UsageError` names a unit that is unknown."""
         try:

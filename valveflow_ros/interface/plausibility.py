@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,6 +158,7 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
     A unit is surely wrong if most values are impossible in it and usual in another unit. Raises
     `RefusedError` with the options that would help.
     """
+    problems, remedies = [], []
     for found in doubts:
         lost = SIGNALS[found.signal].required and found.impossible >= 1.0
         if not lost and not (found.looks_like and found.impossible > _MOST):
@@ -169,29 +170,37 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
                 f'{said.removesuffix(".")}; name the right column with --column '
                 f'{topic}={THEIRS}[:unit], or give --constant {topic}=VALUE'
             )
-        raise RefusedError(
-            path, f"'{theirs}' is taken for {said}", [found.remedy(theirs)], last=True
-        )
+        problems.append(f"'{theirs}' is taken for {said}")
+        remedies.append(found.remedy(theirs))
+    if problems:
+        raise RefusedError(path, problems, remedies, last=True)
 
 
 def refuse_guesses(
-    path: object, doubts: Iterable[Doubt], guessed: Container[Signal], names: dict[Signal, str]
-) -> None:
+    path: object, doubts: Sequence[Doubt], guessed: Container[Signal],
+    unsaid: Container[Signal], names: dict[Signal, str], strict: bool = False,
+) -> None:  # fmt: skip
     """Refuse columns that were found by their names and whose values contradict this.
 
-    Raises `RefusedError` with the options that would help.
+    If there is one among the ``guessed``, or with ``strict``, those of ``unsaid``, whose unit the
+    user did not give, are refused in the same message. Raises `RefusedError` with the options
+    that would help.
     """
+    doubts = [found for found in doubts if found.looks_like or found.impossible > _MOST]
+    if not strict and not any(found.signal in guessed for found in doubts):
+        return
     problems, remedies = [], []
     for found in doubts:
-        if found.signal in guessed and (found.looks_like or found.impossible > _MOST):
-            topic, theirs = SIGNALS[found.signal].topic, names[found.signal]
-            said = found.advice(theirs).removeprefix(f'{topic}: ')
-            if not found.looks_like:
-                chosen = option(topic, theirs, SIGNALS[found.signal].unit)
-                said += f' If it is that signal all the same, add {chosen}; if not, name the right'
-                said += f' one with --column {topic}={THEIRS}[:unit]'
-            problems.append(f"'{theirs}' reads like {topic}, but {said}")
-            remedies.append(found.remedy(theirs))
+        if found.signal not in unsaid:
+            continue
+        topic, theirs = SIGNALS[found.signal].topic, names[found.signal]
+        said = found.advice(theirs).removeprefix(f'{topic}: ')
+        if not found.looks_like:
+            chosen = option(topic, theirs, SIGNALS[found.signal].unit)
+            said += f' If it is that signal all the same, add {chosen}; if not, name the right'
+            said += f' one with --column {topic}={THEIRS}[:unit]'
+        problems.append(f"'{theirs}' reads like {topic}, but {said}")
+        remedies.append(found.remedy(theirs))
     if problems:
         raise RefusedError(path, problems, remedies, last=True)
 

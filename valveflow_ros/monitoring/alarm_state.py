@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -86,11 +87,12 @@ class AlarmChange:
 
 
 class Judged(NamedTuple):
-    """A time, the evidence at that time, and the corresponding shift."""
+    """A time, the evidence at that time, the corresponding shift, and the valve opening."""
 
     time_ns: int
     evidence: float
     shift_mw: float
+    opening_percent: float = math.nan
 
 
 class AlarmStateMachine(Memory):

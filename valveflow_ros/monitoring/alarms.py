@@ -51,6 +51,7 @@ _SOON, _LONGEST = 7, 8
 # Events at a row, as bits.
 _TURNED, _DARKENED, _SEEING, _SET_BACK, _DUE = 1, 2, 4, 8, 16
 _NEVER = (1 << 63) - 1
+_SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
 class _Delays(NamedTuple):
@@ -190,7 +191,7 @@ class ResidualAlarm(Alarm):
     NAME = 'residual'
     REMEMBERED = (
         *Alarm.REMEMBERED, '_memory', '_span', 'judged', 'onset_ns', '_returned_ns', '_longer',
-        '_left_mw',
+        '_left_mw', '_opening_percent',
     )  # fmt: skip
 
     def __init__(self, settings: Settings) -> None:
@@ -199,7 +200,8 @@ class ResidualAlarm(Alarm):
         self.onset_ns = 0
         self._returned_ns: int | None = None
         self._longer = 1  # factor of the return delay
-        self._left_mw = 0.0  # difference from the curve when the alarm was raised
+        # Difference from the curve, and valve opening, when the alarm was raised.
+        self._left_mw, self._opening_percent = 0.0, math.nan
         self.judged = Judged(0, math.nan, math.nan)
         super().__init__(settings)
 
@@ -220,7 +222,7 @@ class ResidualAlarm(Alarm):
 
     def restore(self, saved: State) -> None:
         """Continue from a saved state; earlier versions did not store the range of u."""
-        new = {'returned_ns': None, 'longer': 1, 'left_mw': 0.0}
+        new = {'returned_ns': None, 'longer': 1, 'left_mw': 0.0, 'opening_percent': math.nan}
         saved = {**new, **saved.get('life', {}), **saved}
         memory = saved.get('memory')
         if 'span' not in saved and isinstance(memory, np.ndarray):
@@ -248,6 +250,7 @@ class ResidualAlarm(Alarm):
         model_id: str,
         beside: Sequence[Alarm] = (),
         u: FloatArray | None = None,
+        opening_percent: FloatArray | None = None,
     ) -> list[tuple[int, AlarmChange]]:
         """Judge rows; return changes, each with the number of rows up to it.
 
@@ -260,8 +263,11 @@ class ResidualAlarm(Alarm):
             Other alarms, whose time advances row by row as well.
         u : float64 (n,), optional
             Position of the unit on the curve.
+        opening_percent : float64 (n,), optional
+            Valve opening, for the sentence.
         """
         u = np.zeros(len(time_ns)) if u is None else u
+        opening = np.full(len(time_ns), math.nan) if opening_percent is None else opening_percent
         changes: list[tuple[int, AlarmChange]] = []
         everyone = [self, *beside]
         done = 0
@@ -276,7 +282,9 @@ class ResidualAlarm(Alarm):
                 break
             done += taken
             now_ns = int(time_ns[done - 1])
-            self.judged = Judged(now_ns, float(evidence[done - 1]), float(shift_mw[done - 1]))
+            self.judged = Judged(
+                now_ns, *(float(a[done - 1]) for a in (evidence, shift_mw, opening))
+            )
             self._happened(now_ns, everyone)
             changes += [(done, c) for a in everyone for c in a.pass_time(now_ns, model_id)]
         return changes
@@ -302,6 +310,7 @@ class ResidualAlarm(Alarm):
             again = before_ns is not None and now_ns - before_ns <= _SOON * self._delays.off_ns
             self._longer = min(2 * self._longer, _LONGEST) if again else 1
             self._left_mw = self.judged.shift_mw
+            self._opening_percent = self.judged.opening_percent
             self.begin(now_ns)
         elif what & _TURNED:
             self._returned_ns = now_ns
@@ -309,15 +318,18 @@ class ResidualAlarm(Alarm):
 
     def _content(self, state: AlarmState) -> Content:
         value, shift_mw = self.judged.evidence, self.judged.shift_mw
+        where = ''
+        if state in _SHOWN and math.isfinite(self._opening_percent):
+            where = f' The alarm was raised at {self._opening_percent:.0f} % opening.'
         if abs(shift_mw) > 0.0 or state != AlarmState.UNACKNOWLEDGED or not self._left_mw:
-            return Content(value, _LIMIT, '', _sentence(state, shift_mw, self.onset_ns))
+            return Content(value, _LIMIT, '', _sentence(state, shift_mw, self.onset_ns) + where)
         side = 'more' if self._left_mw > 0.0 else 'less'
         sentence = (
             f'The unit gave {abs(self._left_mw):.1f} MW {side} than its valve curve (mean over '
             'the loads seen). Since then the difference has been within the limit, but not for '
             'long enough at the openings of the alarm.'
         )
-        return Content(value, _LIMIT, '', sentence)
+        return Content(value, _LIMIT, '', sentence + where)
 
     def _blind(self) -> str:
         minutes = self._delays.dark_ns / (60.0 * NS_PER_S)
@@ -364,7 +376,6 @@ _CLEAR = 2.0
 _OVERLAP = 0.5
 # Judgements are independent after this fraction of the refit period (< 1, as fits take time).
 _APART = 0.9
-_SHOWN = (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
 
 
 class ShiftAlarm(Alarm):
@@ -544,12 +555,15 @@ class Alarms:
         for alarm in self._all:
             alarm.configure(settings)
 
-    def feed(self, block: PredictionBlock) -> list[AlarmChange]:
+    def feed(
+        self, block: PredictionBlock, opening_percent: FloatArray | None = None
+    ) -> list[AlarmChange]:
         """Judge predicted rows; return the changes in the order of the rows."""
         judged = np.where(np.isfinite(block.residual_mw), block.evidence, np.nan)
         changes = self._residual.feed(
-            block.time_ns, judged, block.shift_mw, block.model_id, [self._shift], block.u
-        )
+            block.time_ns, judged, block.shift_mw, block.model_id, [self._shift], block.u,
+            opening_percent,
+        )  # fmt: skip
         return [change for _, change in changes]
 
     def operate(

@@ -377,7 +377,7 @@ class Monitor(Memory):
         self.judged = Judged(self.last_ns, float(block.evidence[-1]), float(block.shift_mw[-1]))
         events.append(block)
         if self.predicting is not None:
-            events += self._alarms.feed(block)
+            events += self._alarms.feed(block, rows.opening_percent)
         for _, found in segmented.found:
             self._window.add_segment(found)
             self._refits.segments_seen += 1

@@ -19,7 +19,7 @@ from dataclasses import replace
 from datetime import tzinfo
 from hashlib import sha256
 from importlib import resources
-from itertools import chain, pairwise
+from itertools import chain, groupby, pairwise
 from typing import Any, NamedTuple
 
 from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_update
@@ -211,13 +211,20 @@ def _against(rows: Sequence[tuple[float, ...]], band: str, zone: tzinfo | None) 
     times, *columns = zip(*rows, strict=True)
     t = list(times) if zone is None else [local_ms(ms, zone) for ms in times]
     measured, predicted, low, high = map(rounded, columns)
-    edge: Any = {'line': {'width': 0}, 'showlegend': False}
+    around: list[tuple[Any, float | None]] = []  # one closed outline between two gaps
+    for there, run in groupby(zip(t, low, high, strict=True), lambda row: row[1] is not None):
+        if there:
+            edges = list(run)
+            around += [(None, None)] if around else []
+            around += [(at, bottom) for at, bottom, _ in edges]
+            around += [(at, top) for at, _, top in reversed(edges)]
+    x, y = zip(*around, strict=True) if around else ((), ())
     traces = [
-        line(t, low, '', 'band', **edge),
-        line(t, high, band, 'band', line={'width': 0}, fill='tonexty', fillcolor=token('band')),
+        line(list(x), list(y), band, 'band', line={'width': 0}, fill='toself',
+             fillcolor=token('band')),
         line(t, predicted, 'predicted', 'curve', '%{y:.1f} MW predicted<extra></extra>'),
         line(t, measured, 'measured', 'steady', '%{y:.1f} MW measured<extra></extra>', width=1.5),
-    ]
+    ]  # fmt: skip
     # No fixed range: updating it would undo the scrolling of the user.
     across = axis('', type='date', tickangle=0, nticks=6)
     return {'data': traces, 'layout': {'xaxis': across, 'yaxis': axis('power (MW)')}}

@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -41,13 +42,22 @@ def check_drawing() -> None:
     Raises
     ------
     InputError
-        matplotlib is not installed.
+        matplotlib is not installed, or cannot be loaded.
     """
+    same = 'report.html has the same pictures and needs no library.'
     if find_spec('matplotlib') is None:
         raise InputError(
             "--figures needs the Python package 'matplotlib', which is not installed: pip install "
-            'matplotlib. report.html has the same pictures and needs no library.'
+            f'matplotlib. {same}'
         )
+    try:
+        # A library that is missing or of another version shows only when it is loaded.
+        import_module('matplotlib.backends.backend_agg')
+    except Exception as error:
+        raise InputError(
+            "--figures needs the Python package 'matplotlib', which is installed but cannot be "
+            f'loaded ({error}): pip install --force-reinstall matplotlib. {same}'
+        ) from error
 
 
 def palette() -> Mapping[str, str]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from datetime import datetime, timezone, tzinfo
+from datetime import datetime, timedelta, timezone, tzinfo
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -165,10 +165,14 @@ def moment(time_ns: int) -> str:
 
 
 _UTC_MOMENT = re.compile(r'(\d{4}-\d\d-\d\d \d\d:\d\d(?::\d\d)?) UTC(?![\w+-])')
+_UTC_HOUR = re.compile(r'\b((?:[01]\d|2[0-3]):[0-5]\d) UTC(?![\w+-])')
 
 
 def in_zone(said: str, zone: tzinfo | None) -> str:
-    """Return a text with its times, like '2023-11-15 00:00 UTC', in a time zone; None: UTC."""
+    """Return a text with its times, like '2023-11-15 00:00 UTC', in a time zone; None: UTC.
+
+    A time of day without a date, like '13:20 UTC', is given in the winter time of the zone.
+    """
     if zone is None:
         return said
 
@@ -176,7 +180,15 @@ def in_zone(said: str, zone: tzinfo | None) -> str:
         at = datetime.fromisoformat(f'{found[1]}+00:00').astimezone(zone)
         return f'{at:%Y-%m-%d %H:%M:%S}'[: len(found[1])] + f' {at.tzname()}'
 
-    return _UTC_MOMENT.sub(local, said)
+    def hour(found: re.Match[str]) -> str:
+        days = (
+            datetime.fromisoformat(f'2023-{month}-01 {found[1]}+00:00').astimezone(zone)
+            for month in ('01', '07')
+        )
+        at = min(days, key=lambda day: day.dst() or timedelta())
+        return f'{at:%H:%M} {at.tzname()}'
+
+    return _UTC_HOUR.sub(hour, _UTC_MOMENT.sub(local, said))
 
 
 def floor_words(disturbed: bool) -> str:

@@ -185,15 +185,12 @@ def _imported(
             spool.close()
         last = f'Wrote {place}.'
     from valveflow_ros.logs.tables.refusal import Remedy
-    from valveflow_ros.records import zone_of
-    from valveflow_ros.report.words import in_zone
 
     zone = mapping.table.time_zone
     if place and zone:
         last += f' Its times are in UTC: add {Remedy("time-zone", zone)} to identify and diagnose'
         last += ' to see local times.'
-    said = in_zone('\n'.join([*_understood(table), last]), zone_of(zone))
-    return VerbResult(said, {'log': place, **table.summary()})
+    return VerbResult('\n'.join([*_understood(table), last]), {'log': place, **table.summary()})
 
 
 def _written(options: Namespace, table: TableImport) -> Path:

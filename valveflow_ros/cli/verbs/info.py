@@ -97,10 +97,11 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
         'damaged_chunks': contents.damaged_chunks,
         'warnings': list(log.notes),
     }
-    return command.VerbResult(_text(data, signals), data)
+    name = contents.path if options.log.name not in ('', '..') else log.name
+    return command.VerbResult(_text(str(name), data, signals), data)
 
 
-def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
+def _text(name: str, data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
     from valveflow_ros.records import SIGNALS
     from valveflow_ros.report.words import count, counted, duration, moment, plain
 
@@ -143,7 +144,7 @@ def _text(data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
     )
     damaged = data['damaged_chunks'] and counted(data['damaged_chunks'], 'place')
     return command.lines(
-        data['log'],
+        name,
         span,
         command.table(topics, ['topic', 'type', 'messages', 'rate']),
         command.table(rows, head),

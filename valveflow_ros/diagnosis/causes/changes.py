@@ -393,9 +393,10 @@ def diurnal_starts(screening: Screening) -> Sequence[Start]:
 
 def diurnal_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
+    minutes = round(values['peak_h'] * 60.0) % 1440
     return (
         f'The power varies by ±{100.0 * abs(values["a"]):.2g} % every day, highest at '
-        f'{values["peak_h"] % 24.0:.1f} h UTC (condenser and cooling water follow the day).'
+        f'{minutes // 60:02d}:{minutes % 60:02d} UTC (condenser and cooling water follow the day).'
     )
 
 

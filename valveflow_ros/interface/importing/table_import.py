@@ -436,16 +436,14 @@ class TableImport:
         doubts = [found for found in judged if found is not None]
         guessed = {_SIGNALS[name] for name in reader.grounds}
         names = {_SIGNALS[name]: theirs for name, theirs in reader.names.items()}
-        said = {c.name for c in self._mapping.columns.values() if c.unit}
-        unsaid = {signal for signal in names if SIGNALS[signal].topic not in said}
-        for strict, grounds in ((False, guessed), (True, unsaid)):
+        try:
             # If anything is refused, report all other problems in the same message.
-            if strict and not (self._strict or refused):
-                break
-            try:
-                plausibility.refuse_guesses(reader.path, doubts, grounds, names)
-            except RefusedError as error:
-                refused = [one for one in refused if not one.last] + [error]
+            plausibility.refuse_guesses(
+                reader.path, doubts, guessed, self._mapping.unsaid(names), names,
+                strict=self._strict or bool(refused),
+            )  # fmt: skip
+        except RefusedError as error:
+            refused.append(error)
         if refused:
             # The interpretation so far helps the user to correct the command.
             for sentence in reader.understood():

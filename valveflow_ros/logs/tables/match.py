@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from valveflow_ros.errors import InputError
+from valveflow_ros.errors import InputError, listed
 from valveflow_ros.logs.tables import words
 from valveflow_ros.logs.tables.file import Heading
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
@@ -127,8 +127,8 @@ class Matcher:
             elif best and info.required:
                 names = [self.names[k] for k in best]
                 options = ' or '.join(option(info.topic, name) for name in names[:4])
-                listed = ' and '.join(f"'{name}'" for name in names[:8])
-                several.append(f'{listed} could each be {info.topic}: add {options}')
+                which = listed([f"'{name}'" for name in names[:8]])
+                several.append(f'{which} could each be {info.topic}: add {options}')
                 remedies.append(choosing(info.topic, names[0]))
             elif info.required and info.signal not in spared:
                 missing.append(info.topic)
@@ -172,11 +172,14 @@ class Matcher:
         parts = [*several]
         if topics:
             told = [f"there is no {self.what} '{theirs}'" for theirs in absent.values()]
-            if unknown := ' or '.join(missing + times):
+            if unknown := listed(missing + times, 'or'):
                 told.append(f'no {self.what} was recognised as {unknown}')
             unit = '' if topics == [TIME] else '[:unit]'
             options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in topics)
+            cold = SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic
             constant = ', or give --constant NAME=VALUE for what hardly changes'
+            if cold in missing:
+                constant = f', or the usual temperature with --constant {cold}={_USUAL_DEGC}'
             apart = f', or say with --period {_PERIOD} how far apart the rows are' if times else ''
             parts.append(
                 f'{", ".join(told)}; the {self.what}s are: {self._have(chosen)}. Name '
