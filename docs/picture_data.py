@@ -56,7 +56,7 @@ CASES = {
     'curve_shape': Case('h_mw=3,u0=1425,width_u=150', ('u', 'map pressure given u'), earlier=True),
     'curve_step': Case('s_mw=-5,t0_days=2', ('time', 'map time')),
     'diurnal': Case('a=0.01', ('time of day', 'time')),
-    'exponent': Case('dm=0.12', ('pressure given u', 'map pressure given u')),
+    'exponent': Case('dm=0.12', ('pressure given u', 'map pressure given u'), earlier=True),
     'gain_drift': Case('g=0.04', ('time', 'map time')),
     'gain_step': Case('g=0.012,t0_days=2', ('time', 'map time')),
     'input_drift': Case('g=0.04', ('time', 'map time')),

@@ -58,6 +58,16 @@ def test_a_unit_of_the_paper_s_form_keeps_it():
     assert error_mw(plant(unit=unit), found.characteristic) < 1.0
 
 
+def test_the_exponent_of_a_healthy_unit_is_a_cause_only_if_another_one_was_given():
+    log = plant(unit='integrated_input:number=2,vacuum_per_kpa=0').log
+    own, asked = vf.diagnose(log), vf.diagnose(log, parameters={'pressure_exponent': 1.125})
+    assert 'exponent' not in {c.name for c in own.diagnosis.causes}
+    assert own.form.exponent == pytest.approx(1.06, abs=0.03)
+    assert any('exponent m of the pressure was fitted' in n for n in own.diagnosis.notes)
+    (named,) = [c for c in asked.diagnosis.causes if c.name == 'exponent']
+    assert named.parameters['dm'].value == pytest.approx(own.form.exponent - 1.125, abs=0.02)
+
+
 @pytest.mark.parametrize('seed', [401, pytest.param(406, marks=pytest.mark.long)])
 def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
     simulation = vf.simulate(4.0, seed, unit=f'sequence:number={seed}')

@@ -46,6 +46,10 @@ _TRY_A_COLUMN = (
     'pressure: try --covariate NAME=COLUMN[:UNIT] (a recording has it as a topic if import had '
     'this option too).'
 )
+_FITTED_EXPONENT = (
+    'The exponent m of the pressure was fitted to this log: {:.3f}. To have another one checked, '
+    'give it with --set pressure_exponent=..., or a model with --model.'
+)
 _TAKE_IT_OUT = (
     'Curve and alarms can leave out {}: give the extended_model.json of this diagnosis to '
     'identify --model and monitor --model, or to the node as model_file.'
@@ -154,7 +158,8 @@ def diagnose(
     log : Log, str, Path or pandas.DataFrame
         The result of `open_log`, or anything that it opens.
     parameters : mapping, optional
-        Parameters of the monitor by name.
+        Parameters of the monitor by name. Another exponent of the pressure than a given
+        ``pressure_exponent`` is a cause; without it the model has the exponent that fits the log.
     model : Characteristic, ExtendedModel or path, optional
         The log is compared with this model; by default a model is found in the log itself.
         The causes of an extended model are removed from the rows before the comparison.
@@ -178,7 +183,7 @@ def diagnose(
     check_output(log.output_unit, model=model)
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
-    rows = _rows(log, settings, model is None, progress, earlier)
+    rows = _rows(log, settings, model is None, progress, earlier, 'pressure_exponent' in given)
     if rows.why:
         progress.warn(rows.why)
         notes.append(rows.why)
@@ -189,6 +194,12 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
+    if (
+        model is None
+        and not form.scaled
+        and form != StaticForm(exponent=settings.real('pressure_exponent'))
+    ):
+        notes.append(_FITTED_EXPONENT.format(form.exponent))
     beside = _covariate_rows(log, covariates, rows.table)
     record = search.Record(
         rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
@@ -240,8 +251,9 @@ def _covariate_rows(
 
 
 def _rows(
-    log: Log, settings: Settings, wanted: bool, progress: Progress, earlier: ExtendedModel | None
-) -> _Rows:
+    log: Log, settings: Settings, wanted: bool, progress: Progress,
+    earlier: ExtendedModel | None, exponent_given: bool,
+) -> _Rows:  # fmt: skip
     """Align the log and find special segments; continue without them if all signals are there."""
     try:
         observed = observe_log(log, settings, progress, earlier)
@@ -264,7 +276,7 @@ def _rows(
     if not wanted:
         return rows
     try:
-        model, form = observed.outline(progress)
+        model, form = observed.outline(progress, exponent_given)
         return replace(rows, model=model, form=form)
     except DataError as error:
         return replace(rows, why=f'{error} All rows are used instead.')

@@ -86,15 +86,17 @@ class Observed:
         return form_contradicted(self.task, given)
 
     def outline(
-        self, progress: Callable[[float, str], None] = SILENT
+        self, progress: Callable[[float, str], None] = SILENT, exponent_given: bool = False
     ) -> tuple[RegionalModel, StaticForm]:
-        """Return curve and dynamics as start of a diagnosis; raises `DataError` like `fit`.
+        """Return curve, dynamics and form as start of a diagnosis; raises `DataError` like `fit`.
 
-        Unless the data require breakpoints at fixed openings, the form is the paper's with the
-        exponent of the settings: another exponent is a cause, which the diagnosis must name.
+        With ``exponent_given`` the paper's form keeps the exponent of the settings: another one is
+        then a cause, which the diagnosis must name. Breakpoints at fixed openings are used if the
+        data require them.
         """
-        scaled = form_of_data(self.task).scaled
-        task = self.task if scaled else replace(self.task, form=self.paper_form)
+        task = self.task
+        if exponent_given and not form_of_data(task).scaled:
+            task = replace(task, form=self.paper_form)
         return outline(task, lambda what: progress(0.6, what))
 
 
