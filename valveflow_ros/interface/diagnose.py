@@ -14,6 +14,7 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
+from valveflow_ros.diagnosis.corrector import covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
@@ -183,7 +184,10 @@ def diagnose(
     check_output(log.output_unit, model=model)
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
-    rows = _rows(log, settings, model is None, progress, earlier, 'pressure_exponent' in given)
+    own = {n: said for n, said in covariates.items() if n in covariates_of(earlier)}
+    rows = _rows(
+        log, settings, model is None, progress, earlier, own, 'pressure_exponent' in given
+    )
     if rows.why:
         progress.warn(rows.why)
         notes.append(rows.why)
@@ -252,13 +256,13 @@ def _covariate_rows(
 
 def _rows(
     log: Log, settings: Settings, wanted: bool, progress: Progress,
-    earlier: ExtendedModel | None, exponent_given: bool,
+    earlier: ExtendedModel | None, said: Mapping[str, str], exponent_given: bool,
 ) -> _Rows:  # fmt: skip
     """Align the log and find special segments; continue without them if all signals are there."""
     try:
-        observed = observe_log(log, settings, progress, earlier)
+        observed = observe_log(log, settings, progress, earlier, said=said)
     except DataError as error:
-        columns = Covariates.of(log, earlier)
+        columns = Covariates.of(log, earlier, said)
         corrector = columns.corrector_of(earlier, settings)
         blocks = columns.beside(aligned_blocks(Aligner(settings), log.readings, None, ''))
         table = gathered(corrected(blocks, corrector)).table
