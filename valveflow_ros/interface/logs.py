@@ -406,10 +406,10 @@ def _further(source: Any, mapping: LogMapping) -> list[str]:
         if Path(source).suffix.lower() in TABLE_SUFFIXES:
             topics = [info.topic for info in SIGNALS]
             return TableReader(source, mapping.names(), topics, mapping.table).numeric_ignored
-        topics = read_file(source, columns=mapping.names()).topics.values()
+        found = read_file(source, columns=mapping.names()).topics.values()
     except InputError:
         return []
-    return [t.name.lstrip('/') for t in topics if t.type == _NUMBER and t.signal is None]
+    return [t.name.lstrip('/') for t in found if t.type == _NUMBER and t.signal is None]
 
 
 def _offered(name: str, said: str, others: list[str]) -> str:
