@@ -639,6 +639,9 @@ def _conclude(
     task, final = _final(found)
     progress(0.9, 'how sure it is')
     estimates = Certainty(task, final).intervals() if final.active else {}
+    if 'temperature' in estimates and rest.drift.there:
+        share = rest.drift.rms_mw / math.sqrt(max(_explained(found, 'temperature'), 1e-12))
+        estimates['temperature'] = _beside_drift(estimates['temperature'], share)
     place = final.place_words(grids.form)
     sentences = {
         a.name: a.sentence(grids.start_ns, estimates[a.name], place) for a in final.active
@@ -702,6 +705,30 @@ def _of_covariates(model: Extended) -> list[str]:
                 '+ a2 (L - 1)^2, because column and load may have changed together by chance.'
             )
     return told
+
+
+def _beside_drift(k: dict[str, Estimate], share: float) -> dict[str, Estimate]:
+    """Return the size of a temperature effect with the error that a slow disturbance adds.
+
+    Parameters
+    ----------
+    share : float
+        Root mean square of the disturbance over that of the effect.
+
+    Notes
+    -----
+    A condenser that is not in the log follows the load with a lag, as the temperature of the
+    steam does: the two agree a little, and the size contains this part of the disturbance.
+    """
+    error = _AGREES * share
+    return {
+        name: replace(
+            e,
+            low=e.value - math.hypot(e.value - e.low, error * e.value),
+            high=e.value + math.hypot(e.high - e.value, error * e.value),
+        )
+        for name, e in k.items()
+    }
 
 
 def _other_bend(task: Task, final: Extended, found: SearchResult) -> dict[str, Estimate]:
