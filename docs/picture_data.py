@@ -40,12 +40,15 @@ class Case:
     earlier : bool
         Diagnosed against the curve of an earlier, healthy record: an identification of the
         same record would take the effect for the unit's own.
+    exponent : float, optional
+        Exponent of the pressure that is given to the diagnosis, for the same reason.
     """
 
     parameters: str
     views: tuple[str, ...]
     days: int = 5
     earlier: bool = False
+    exponent: float | None = None
 
 
 # Larger than the smallest that is found, so that an eye sees it too.
@@ -56,7 +59,7 @@ CASES = {
     'curve_shape': Case('h_mw=3,u0=1425,width_u=150', ('u', 'map pressure given u'), earlier=True),
     'curve_step': Case('s_mw=-5,t0_days=2', ('time', 'map time')),
     'diurnal': Case('a=0.01', ('time of day', 'time')),
-    'exponent': Case('dm=0.12', ('pressure given u', 'map pressure given u')),
+    'exponent': Case('dm=0.12', ('pressure given u', 'map pressure given u'), exponent=1.125),
     'gain_drift': Case('g=0.04', ('time', 'map time')),
     'gain_step': Case('g=0.012,t0_days=2', ('time', 'map time')),
     'input_drift': Case('g=0.04', ('time', 'map time')),
@@ -83,6 +86,8 @@ def commands(name: str) -> list[str]:
         f'valveflow simulate -o {name}.mcap {made} --effect {name}:{case.parameters}',
         f'valveflow diagnose {name}.mcap -o {name}',
     ]
+    if case.exponent is not None:
+        lines[-1] += f' --set pressure_exponent={case.exponent:g}'
     if case.earlier:
         lines[-1] += ' --model healthy/characteristic.json'
         lines = [
@@ -168,7 +173,8 @@ def gather(name: str) -> dict[str, Any]:
         path = Path(folder) / f'{name}.parquet'
         write_table(log.table, path)
         model = _healthy(case.days, Path(folder)) if case.earlier else None
-        found = diagnose(path, model=model).data
+        law = {} if case.exponent is None else {'pressure_exponent': case.exponent}
+        found = diagnose(path, parameters=law, model=model).data
     told = to_json(found.diagnosis)
     views = _views(found, case.views)
     if 'record' in case.views:

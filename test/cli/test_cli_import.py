@@ -11,6 +11,7 @@ import pytest
 from logged import values
 
 import valveflow_ros as vf
+from valveflow_ros.errors import InputError
 from valveflow_ros.interface.importing import table_import
 from valveflow_ros.interface.logs import read_covariate
 from valveflow_ros.logs import open_log
@@ -164,6 +165,8 @@ def test_a_further_column_is_kept_as_a_topic_with_its_unit(run, tmp_path, write_
     assert ran.json['ignored'] == ['temperature', 'Spare']
     (kept,) = ran.json['covariates']
     assert (kept['name'], kept['unit'], kept['low'], kept['high']) == ('vacuum', 'kPa', 5.0, 5.06)
+    with pytest.raises(InputError, match='; it has vacuum: --covariate x=vacuum'):
+        read_covariate(vf.open_log(log), 'x', 'condenser')
     series = read_covariate(vf.open_log(log), 'vacuum', 'vacuum')
     assert series.unit == 'kPa'
     assert (np.diff(series.time_ns) >= 0).all()

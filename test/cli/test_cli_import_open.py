@@ -216,6 +216,18 @@ def test_a_table_without_times_has_a_period(run, tmp_path, frame, said):
     assert vf.open_log(path, period=said).span_s == 60.0 * (len(ROWS) - 1)
 
 
+@pytest.mark.parametrize('times', [None, '', 'row', '12:01', range(len(ROWS))])
+def test_a_table_without_usable_times_gets_a_period_offered(run, tmp_path, frame, times):
+    path, log = tmp_path / 'a.csv', tmp_path / 'x.mcap'
+    frame = frame if times is None else frame.assign(time=times)
+    frame.to_csv(path, index=False)
+    if not isinstance(times, range):  # row numbers may be seconds
+        refused = run('import', path, '-o', log).refused()
+        assert refused.endswith('--period 60s')
+    run('import', path, '-o', log, '--period', '60s').done()
+    assert vf.open_log(log).span_s == 60.0 * (len(ROWS) - 1)
+
+
 @pytest.mark.parametrize('said', ['soon', '0', '-5s', 'nan', '2d', '1e9', ''])
 def test_a_period_that_is_none_is_refused(run, tmp_path, frame, said):
     frame.to_csv(tmp_path / 'a.csv', index=False)

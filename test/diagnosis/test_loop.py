@@ -113,6 +113,13 @@ def test_close_rows_are_averaged_behind_the_plug():
     assert found.verdict == judge_response(command, response, STEP_S).verdict == 'stiction'
 
 
+@pytest.mark.parametrize('step_s', [0.01, 1.0])
+def test_a_record_of_too_few_seconds_is_not_judged(sticking, step_s):
+    found = judge_response(*(a[:400] for a in sticking), step_s)
+    assert found.verdict == NOT_JUDGED
+    assert '500 s are needed' in found.reason
+
+
 def test_gaps_of_a_few_rows_are_bridged_and_long_ones_part_the_record(sticking):
     command, response = (a.copy() for a in sticking)
     command[::90], response[40:690:120] = np.nan, np.inf

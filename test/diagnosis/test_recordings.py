@@ -136,6 +136,16 @@ def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]
     assert any('may come from that' in note for note in found.notes)
 
 
+def test_the_size_of_a_temperature_effect_beside_unlogged_weather_holds_the_truth() -> None:
+    """A condenser that is not in the log agrees a little with the temperature."""
+    unit = 'choked:number=1401'
+    plant = vf.simulate(8, 1401, ['temperature:k=-0.0016'], unit=unit, recording='minute')
+    (cause,) = vf.diagnose(plant.log).diagnosis.causes
+    k = cause.parameters['k']
+    assert cause.name == 'temperature'
+    assert k.low < -0.0016 < k.high < -0.0014
+
+
 def test_a_lag_that_its_error_exceeds_is_not_told() -> None:
     """The values stay in the parameters; the sentence does not tell them."""
     lag = FittedCause(catalogue()['region_lag'], (30.0, 5.0, 250.0))

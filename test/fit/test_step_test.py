@@ -85,6 +85,13 @@ def test_a_test_is_told_from_ordinary_operation():
             assert not looks_like_step_test(day.part(start, start + 7200), SETTINGS)
     still = by_hand([50.0], 2000)
     assert not looks_like_step_test(still, SETTINGS)
+    # In rows a minute apart the moves of a controller are taken for noise.
+    rows = {'sample_period': 60.0, 'block': 60.0, 'hold_limit': 150.0, 'lateness': 60.0}
+    openings, rng = [44.0], np.random.default_rng(5)
+    for _ in range(2000):
+        openings.append(0.9 * openings[-1] + 4.4 + rng.normal(0.0, 0.7))
+    wandering = by_hand(openings, 1)
+    assert not looks_like_step_test(wandering, Settings({**rows, 'alarm_block': 120.0}))
 
 
 @examples(30)

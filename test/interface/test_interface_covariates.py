@@ -15,7 +15,7 @@ from streams import needs_jit
 import valveflow_ros as vf
 from valveflow_ros.diagnosis.corrector import corrector_of, covariates_of
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json, to_json
-from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.errors import DataError, InputError, UsageError
 from valveflow_ros.interface.logs import Series, open_log, read_covariate
 from valveflow_ros.records import SIGNALS, SampleTable, Signal
 from valveflow_ros.signals.covariates import entry
@@ -150,6 +150,13 @@ def test_a_curve_and_a_monitor_without_the_weather(plant, diagnosed, tmp_path):
     assert [h.name for h in freed.characteristic.held] == list(model.model.names)
     told = vf.monitor(path, model=model, diagnose=False, parameters=NIGHTLY)
     assert told.curves[-1][1].residuals.rmse_mw < 0.75 * rmse[0]
+    renamed = plant.to_dataframe().rename(columns={COLUMN: 'Kond'})
+    again = vf.identify(renamed, model=model, covariates={'vacuum': 'Kond:kPa'})
+    assert again.characteristic.pieces == freed.characteristic.pieces
+    with pytest.raises(InputError, match=r'The model follows a further column\..*vacuum=Kond'):
+        vf.identify(renamed, model=model)
+    with pytest.raises(UsageError, match='needs a column only for a covariate of its --model'):
+        vf.identify(renamed, covariates={'vacuum': 'Kond'})
     without = plant.to_dataframe().drop(columns=COLUMN)
     with pytest.raises(InputError, match=f"has no column or topic '{COLUMN}"):
         vf.identify(without, model=model)
@@ -250,6 +257,15 @@ def test_what_is_no_covariate_is_refused(plant, said, sentence):
     if 'few' not in said:  # the monitor leaves it out of a diagnosis, and says so
         with pytest.raises(InputError, match=sentence):
             vf.monitor(frame, covariates=said)
+
+
+def test_the_columns_that_a_log_has_are_offered(plant, tmp_path):
+    frame = plant.to_dataframe().head(1500)
+    kept = frame.rename(columns={COLUMN: 'vacuum'}).assign(words='low')
+    kept.to_csv(tmp_path / 'a.csv', index=False)
+    for source in (kept, tmp_path / 'a.csv'):
+        with pytest.raises(InputError, match=r"'vacum'; it has .*: --covariate x=vacuum\."):
+            vf.diagnose(source, covariates={'x': 'vacum'})
 
 
 def test_the_parameter_names_them_too(plant):

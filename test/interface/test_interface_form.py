@@ -58,6 +58,26 @@ def test_a_unit_of_the_paper_s_form_keeps_it():
     assert error_mw(plant(unit=unit), found.characteristic) < 1.0
 
 
+def test_an_exponent_at_the_end_of_its_range_is_said():
+    frame = plant(unit='integrated_input:number=2,vacuum_per_kpa=0').log.to_dataframe()
+    frame['main_steam_pressure_mpa'] = 2.0 * frame['main_steam_pressure_mpa'] ** 0.75
+    notes = vf.identify(frame).characteristic.notes  # m is 1.06 / 0.75
+    assert 'The exponent m of the pressure was fitted: 1.250.' in notes
+    assert any(n.startswith('This is an end of the range 0.9 to 1.25') for n in notes)
+    own = identified(unit='integrated_input:number=2,vacuum_per_kpa=0').characteristic.notes
+    assert not any('end of the range' in n for n in own)
+
+
+def test_the_exponent_of_a_healthy_unit_is_a_cause_only_if_another_one_was_given():
+    log = plant(unit='integrated_input:number=2,vacuum_per_kpa=0').log
+    own, asked = vf.diagnose(log), vf.diagnose(log, parameters={'pressure_exponent': 1.125})
+    assert 'exponent' not in {c.name for c in own.diagnosis.causes}
+    assert own.form.exponent == pytest.approx(1.06, abs=0.03)
+    assert any('exponent m of the pressure was fitted' in n for n in own.diagnosis.notes)
+    (named,) = [c for c in asked.diagnosis.causes if c.name == 'exponent']
+    assert named.parameters['dm'].value == pytest.approx(own.form.exponent - 1.125, abs=0.02)
+
+
 @pytest.mark.parametrize('seed', [401, pytest.param(406, marks=pytest.mark.long)])
 def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
     simulation = vf.simulate(4.0, seed, unit=f'sequence:number={seed}')

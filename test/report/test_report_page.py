@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import math
 import re
@@ -18,13 +19,14 @@ import pytest
 from report_stories import diagnosed, history, words_of
 
 from valveflow_ros.curve.characteristic import Support
+from valveflow_ros.curve.segment_residual import segment_residuals
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.errors import InputError
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import Signal
+from valveflow_ros.records import SegmentKind, Signal
 from valveflow_ros.report import page
 from valveflow_ros.report.answer import confidence_table, doubt, gain_by_load
-from valveflow_ros.report.curve import segments_figure, shift_section
+from valveflow_ros.report.curve import segments_figure, shift_section, surface_figure
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.figure import Figure, time_axis, upright
 from valveflow_ros.report.identification import identification_page, identification_report
@@ -121,6 +123,31 @@ def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified)
         both = np.isfinite(mw) & np.isfinite(expected)  # the name has three digits
         assert both.sum() > 20
         assert mw[both] == pytest.approx(expected[both], rel=0.01)
+
+
+def test_the_surface_is_drawn_over_opening_and_pressure_where_the_pressure_moves(identified):
+    assert surface_figure(identified) is None
+    moved = tuple(
+        replace(
+            s, kind=SegmentKind.STEADY, u_start=u, u_end=u, exponent=1.125,
+            power_start_mw=150.0, power_end_mw=150.0, pressure_start_mpa=p, pressure_end_mpa=p,
+            opening_start_percent=u / p**1.125, opening_end_percent=u / p**1.125,
+        )
+        for s, u, p in zip(
+            identified.segments, np.linspace(820.0, 1480.0, len(identified.segments)),
+            itertools.cycle((10.0, 12.0, 15.0)), strict=False,
+        )
+    )  # fmt: skip
+    figure = surface_figure(replace(identified, segments=moved))
+    *lines, dots = figure.traces
+    assert len(lines) >= 4
+    for line, note in zip(lines, figure.layout['annotations'], strict=True):
+        v, p = (np.array(line[k], dtype=float) for k in ('x', 'y'))
+        power = identified.characteristic.power(v, p)
+        assert power[np.isfinite(power)] == pytest.approx(float(note['text'].split()[0]), abs=0.1)
+    residuals = segment_residuals(identified.characteristic, moved).residual_mw
+    assert np.array(dots['marker']['color']) == pytest.approx(residuals, abs=0.1)
+    assert sorted({round(p) for p in dots['y']}) == [10, 12, 15]
 
 
 def test_colours_of_the_pictures_are_in_the_style_sheet(report):

@@ -28,10 +28,11 @@ from valveflow_ros.fit.task import FitTask
 from valveflow_ros.numerics import running_average
 from valveflow_ros.records import COARSE_STEP_S, NS_PER_S, ByteArray, FloatArray, SegmentKind
 from valveflow_ros.segments.window import WindowContents
-from valveflow_ros.signals.static_form import OPENING
+from valveflow_ros.signals.static_form import OPENING, exponents_near
 
 _Z95 = 1.959963984540054
 _MAD_TO_SD = 1.4826022185056018
+_AT_END = 0.5e-3  # an exponent this close to the end of its range did not end by itself
 
 
 def residual_statistics(
@@ -144,7 +145,11 @@ def from_refined(
         breakpoint_intervals=intervals,
         dynamics=dynamics,
         offset_mw=m.offset,
-        notes=(*static.notes, *_form_errors(static, result), *_long_means(result)),
+        notes=(
+            *static.notes,
+            *_form_errors(static, result, exponents_near(task.settings.real('pressure_exponent'))),
+            *_long_means(result),
+        ),
         pressure_scale_exponent=static.pressure_scale_exponent
         + (result.exponent_moved if static.axis == OPENING else 0.0),
         residuals=residual_statistics(
@@ -158,19 +163,30 @@ def from_refined(
     )
 
 
-def _form_errors(static: Characteristic, result: Refined) -> tuple[str, ...]:
-    """Return a note with the fitted exponent and c, and their 95 % intervals; none if given."""
+def _form_errors(
+    static: Characteristic, result: Refined, within: tuple[float, float]
+) -> tuple[str, ...]:
+    """Return notes on the fitted exponent and c, with 95 % intervals; none if they were given.
+
+    ``within`` is the range in which the exponent was searched.
+    """
     if math.isnan(result.exponent_stderr):
         return ()
-    said = 'The exponent m of the pressure was fitted: '
-    m = static.static_form.exponent
-    if static.axis != OPENING:
-        return (f'{said}{m:.3f} ± {_Z95 * result.exponent_stderr:.3f}.',)
-    error = _Z95 * math.sqrt(max(float(result.covariance[-1, -1]), 0.0))
-    m += result.exponent_moved
+    m = static.static_form.exponent + (result.exponent_moved if static.axis == OPENING else 0.0)
+    said = f'The exponent m of the pressure was fitted: {m:.3f}'
+    at_end = min(abs(m - limit) for limit in within) < _AT_END
+    if not at_end:
+        said += f' ± {_Z95 * result.exponent_stderr:.3f}'
+    if static.axis == OPENING:
+        error = _Z95 * math.sqrt(max(float(result.covariance[-1, -1]), 0.0))
+        said += f'; the power without flow is c = {result.model.offset:.1f} ± {error:.1f} MW'
+    if not at_end:
+        return (f'{said}.',)
     return (
-        f'{said}{m:.3f} ± {_Z95 * result.exponent_stderr:.3f}; '
-        f'the power without flow is c = {result.model.offset:.1f} ± {error:.1f} MW.',
+        f'{said}.',
+        f'This is an end of the range {within[0]:.3g} to {within[1]:.3g} in which m is searched, '
+        'and the data ask for one beyond it: check the zero and the range of the pressure '
+        'transmitter, and whether the curve fits over opening and pressure.',
     )
 
 

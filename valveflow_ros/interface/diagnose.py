@@ -14,6 +14,7 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
+from valveflow_ros.diagnosis.corrector import covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
@@ -45,6 +46,10 @@ _TRY_A_COLUMN = (
     'A further signal of the table may explain the slow variation, such as the condenser '
     'pressure: try --covariate NAME=COLUMN[:UNIT] (a recording has it as a topic if import had '
     'this option too).'
+)
+_FITTED_EXPONENT = (
+    'The exponent m of the pressure was fitted to this log: {:.3f}. To have another one checked, '
+    'give it with --set pressure_exponent=..., or a model with --model.'
 )
 _TAKE_IT_OUT = (
     'Curve and alarms can leave out {}: give the extended_model.json of this diagnosis to '
@@ -154,7 +159,8 @@ def diagnose(
     log : Log, str, Path or pandas.DataFrame
         The result of `open_log`, or anything that it opens.
     parameters : mapping, optional
-        Parameters of the monitor by name.
+        Parameters of the monitor by name. Another exponent of the pressure than a given
+        ``pressure_exponent`` is a cause; without it the model has the exponent that fits the log.
     model : Characteristic, ExtendedModel or path, optional
         The log is compared with this model; by default a model is found in the log itself.
         The causes of an extended model are removed from the rows before the comparison.
@@ -178,7 +184,10 @@ def diagnose(
     check_output(log.output_unit, model=model)
     settings, notes = settings_of(log, given, progress)
     earlier = model if isinstance(model, ExtendedModel) and model.held else None
-    rows = _rows(log, settings, model is None, progress, earlier)
+    own = {n: said for n, said in covariates.items() if n in covariates_of(earlier)}
+    rows = _rows(
+        log, settings, model is None, progress, earlier, own, 'pressure_exponent' in given
+    )
     if rows.why:
         progress.warn(rows.why)
         notes.append(rows.why)
@@ -189,6 +198,12 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
+    if (
+        model is None
+        and not form.scaled
+        and form != StaticForm(exponent=settings.real('pressure_exponent'))
+    ):
+        notes.append(_FITTED_EXPONENT.format(form.exponent))
     beside = _covariate_rows(log, covariates, rows.table)
     record = search.Record(
         rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
@@ -240,13 +255,14 @@ def _covariate_rows(
 
 
 def _rows(
-    log: Log, settings: Settings, wanted: bool, progress: Progress, earlier: ExtendedModel | None
-) -> _Rows:
+    log: Log, settings: Settings, wanted: bool, progress: Progress,
+    earlier: ExtendedModel | None, said: Mapping[str, str], exponent_given: bool,
+) -> _Rows:  # fmt: skip
     """Align the log and find special segments; continue without them if all signals are there."""
     try:
-        observed = observe_log(log, settings, progress, earlier)
+        observed = observe_log(log, settings, progress, earlier, said=said)
     except DataError as error:
-        columns = Covariates.of(log, earlier)
+        columns = Covariates.of(log, earlier, said)
         corrector = columns.corrector_of(earlier, settings)
         blocks = columns.beside(aligned_blocks(Aligner(settings), log.readings, None, ''))
         table = gathered(corrected(blocks, corrector)).table
@@ -264,7 +280,7 @@ def _rows(
     if not wanted:
         return rows
     try:
-        model, form = observed.outline(progress)
+        model, form = observed.outline(progress, exponent_given)
         return replace(rows, model=model, form=form)
     except DataError as error:
         return replace(rows, why=f'{error} All rows are used instead.')

@@ -16,9 +16,10 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.curve.compensation import openings_seen
 from valveflow_ros.curve.shift import ShiftLimits, judge_shift, mixture_sentence, shift_json
+from valveflow_ros.diagnosis.corrector import covariates_of
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
-from valveflow_ros.errors import DataError, UsageError
+from valveflow_ros.errors import DataError, UsageError, listed
 from valveflow_ros.fit.model_form import find_misfit
 from valveflow_ros.fit.static_test import find_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
@@ -138,6 +139,7 @@ def identify(
     *,
     parameters: Mapping[str, Any] | None = None,
     model: ExtendedModel | str | Path | None = None,
+    covariates: Mapping[str, str] | None = None,
     reference: Characteristic | str | Path | None = None,
     step_test: bool = False,
     progress: Progress = SILENT,
@@ -153,6 +155,9 @@ def identify(
     model : ExtendedModel or path, optional
         An ``extended_model.json`` of a diagnosis: its causes are kept fixed, curve and dynamics
         are identified again.
+    covariates : mapping of str to str, optional
+        Columns of the covariates of ``model`` that this log calls otherwise, given as ``COLUMN``
+        or ``COLUMN:unit`` by name.
     reference : Characteristic or path, optional
         A curve with which the new one is compared.
     step_test : bool
@@ -169,12 +174,17 @@ def identify(
     if model is not None and step_test:
         raise UsageError('--step-test and --model do not go together.')
     model, given = taken_model(model, parameters, load_extended)
+    if unknown := (covariates or {}).keys() - covariates_of(model).keys():
+        raise UsageError(
+            f'--covariate {min(unknown)}: identify needs a column only for a covariate of its '
+            f'--model, which has {listed(list(covariates_of(model))) or "none"}.'
+        )
     reference = taken_curve(reference)
     log = as_log(log, progress)
     check_output(log.output_unit, model=model, reference=reference)
     found = (
         _step_test(log, given, progress) if step_test
-        else _identified(log, given, model, reference, progress)
+        else _identified(log, given, model, covariates, reference, progress)
     )  # fmt: skip
     seen = openings_seen(*_inputs(found.table))
     found = replace(found, characteristic=replace(found.characteristic, openings_seen=seen))
@@ -188,11 +198,11 @@ def identify(
 
 def _identified(
     log: Log, given: Mapping[str, Any], model: ExtendedModel | None,
-    reference: Characteristic | None, progress: Progress,
+    covariates: Mapping[str, str] | None, reference: Characteristic | None, progress: Progress,
 ) -> Identified:  # fmt: skip
     settings, notes = settings_of(log, given, progress)
     try:
-        observed = observe_log(log, settings, progress, model)
+        observed = observe_log(log, settings, progress, model, said=covariates)
         # The form is kept: another one is not comparable with the reference, nor fits the causes.
         form = None if reference is None else reference.static_form
         form = form if model is None else model.form

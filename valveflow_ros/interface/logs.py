@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,15 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from valveflow_ros.errors import DataError, InputError
+from valveflow_ros.errors import DataError, InputError, listed
 from valveflow_ros.interface import SILENT, Progress, plausibility
 from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, gather_refusals, read_mapping
 from valveflow_ros.interface.plausibility import Doubt
 from valveflow_ros.logs import LogContents
 from valveflow_ros.logs import open_log as read_file
 from valveflow_ros.logs.names import signal_of
+from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
 from valveflow_ros.logs.tables.match import TIME
+from valveflow_ros.logs.tables.reader import TableReader
+from valveflow_ros.logs.tables.refusal import quoted
 from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.records import (
     FLOW_UNITS,
@@ -315,7 +319,10 @@ def read_series(source: Any, mapping: LogMapping, log: str, name: str, said: str
         theirs, told = said, ''
         contents = _column_of(source, mapping, theirs.strip())
     if contents is None:
-        raise InputError(f"--covariate {name}: {log} has no column or topic '{said}'.")
+        raise InputError(
+            f"--covariate {name}: {log} has no column or topic '{said}'"
+            f'{_offered(name, said, _further(source, mapping))}.'
+        )
     mine = contents.readings.signal == _READ_AS
     good = mine & np.isfinite(contents.readings.value) & (contents.readings.quality < Quality.BAD)
     if not good.any():
@@ -373,6 +380,7 @@ _OF_DIFFERENCE, _MOST, _FULL, _USUAL_MW = 0.5, 10.0, 0.995, 300.0
 _GAP_S, _GAP_STEPS = 3600.0, 5.0
 # Readers return signals only: the column is read as this signal, before units are converted.
 _READ_AS = Signal.VALVE_COMMAND
+_NUMBER, _MOST_OFFERED = 'std_msgs/msg/Float64', 12
 
 
 def _column_of(source: Any, mapping: LogMapping, theirs: str) -> LogContents | None:
@@ -386,6 +394,32 @@ def _column_of(source: Any, mapping: LogMapping, theirs: str) -> LogContents | N
         return read_file(source, columns=names, absent=topics, table=mapping.table)
     except InputError:
         return None
+
+
+def _further(source: Any, mapping: LogMapping) -> list[str]:
+    """Return the names of the columns or topics with numbers that are no signals."""
+    try:
+        if hasattr(source, 'columns'):
+            taken = {*_from_dataframe(source, mapping.names()).signals.values(), TIME}
+            numbers = source.select_dtypes('number').columns
+            return [str(name) for name in numbers if name not in taken]
+        if Path(source).suffix.lower() in TABLE_SUFFIXES:
+            topics = [info.topic for info in SIGNALS]
+            return TableReader(source, mapping.names(), topics, mapping.table).numeric_ignored
+        found = read_file(source, columns=mapping.names()).topics.values()
+    except InputError:
+        return []
+    return [t.name.lstrip('/') for t in found if t.type == _NUMBER and t.signal is None]
+
+
+def _offered(name: str, said: str, others: list[str]) -> str:
+    """Return the end of a sentence with the columns that may be meant; '' if there is none."""
+    if not others:
+        return ''
+    near = difflib.get_close_matches(said, others, n=1, cutoff=0.4)
+    near += [other for other in others if said.lower() in other.lower()]
+    example = quoted(f'{name}={(near or others)[0]}')
+    return f'; it has {listed(others[:_MOST_OFFERED])}: --covariate {example}'
 
 
 def _unit_kept(contents: LogContents, topic: str) -> str:

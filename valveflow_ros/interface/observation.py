@@ -16,7 +16,13 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.causes import check_covariates
 from valveflow_ros.diagnosis.corrector import corrector_of, covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
-from valveflow_ros.errors import WORKING_BYTES, DataError, check_address_space, counted
+from valveflow_ros.errors import (
+    WORKING_BYTES,
+    DataError,
+    InputError,
+    check_address_space,
+    counted,
+)
 from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
 from valveflow_ros.fit.task import COARSE_STEP_S, FitTask
 from valveflow_ros.interface import SILENT, Progress
@@ -86,15 +92,17 @@ class Observed:
         return form_contradicted(self.task, given)
 
     def outline(
-        self, progress: Callable[[float, str], None] = SILENT
+        self, progress: Callable[[float, str], None] = SILENT, exponent_given: bool = False
     ) -> tuple[RegionalModel, StaticForm]:
-        """Return curve and dynamics as start of a diagnosis; raises `DataError` like `fit`.
+        """Return curve, dynamics and form as start of a diagnosis; raises `DataError` like `fit`.
 
-        Unless the data require breakpoints at fixed openings, the form is the paper's with the
-        exponent of the settings: another exponent is a cause, which the diagnosis must name.
+        With ``exponent_given`` the paper's form keeps the exponent of the settings: another one is
+        then a cause, which the diagnosis must name. Breakpoints at fixed openings are used if the
+        data require them.
         """
-        scaled = form_of_data(self.task).scaled
-        task = self.task if scaled else replace(self.task, form=self.paper_form)
+        task = self.task
+        if exponent_given and not form_of_data(task).scaled:
+            task = replace(task, form=self.paper_form)
         return outline(task, lambda what: progress(0.6, what))
 
 
@@ -166,12 +174,16 @@ def corrected(blocks: Iterator[Aligned], corrector: Corrector | None) -> Iterato
 def observe_log(
     log: Log, settings: Settings, progress: Progress, model: ExtendedModel | None = None,
     shown: Callable[[float, str], None] | None = None,
+    said: Mapping[str, str] | None = None,
 ) -> Observed:  # fmt: skip
-    """Observe a log as `observe` does; with a ``model`` its causes are removed from the rows."""
+    """Observe a log as `observe` does; with a ``model`` its causes are removed from the rows.
+
+    ``said`` are the columns of covariates of the model that the log calls otherwise.
+    """
     check_address_space(WORKING_BYTES)
     if is_first_run():
         progress.say(SENTENCE)
-    covariates = Covariates.of(log, model)
+    covariates = Covariates.of(log, model, said)
     corrector = covariates.corrector_of(model, settings)
     return observe(log.readings, settings, shown or progress, corrector, covariates)
 
@@ -189,8 +201,12 @@ class Covariates:
     ) -> Covariates:
         """Read the columns that a user names, and those that causes of a model follow."""
         own = {n: f'{c.column}:{c.unit}' for n, c in covariates_of(model).items()}
-        wanted = {**own, **(said or {})}
-        return cls({name: read_covariate(log, name, theirs) for name, theirs in wanted.items()})
+        said = said or {}
+        try:
+            found = {n: read_covariate(log, n, own[n]) for n in own if n not in said}
+        except InputError as error:
+            raise InputError(f'The model follows a further column. {error}') from None
+        return cls({**found, **{n: read_covariate(log, n, theirs) for n, theirs in said.items()}})
 
     def corrector_of(self, model: ExtendedModel | None, settings: Settings) -> Corrector | None:
         """Return the corrector of a model for rows with these columns; None without a model."""

@@ -29,6 +29,8 @@ _LEAST = 3  # fewer segments are not drawn
 _SURE = 0.9999
 _SAME_PRESSURE = 0.02
 _OPENINGS = 121
+_PRESSURE_MOVES = 0.1  # of its median, below which there is no figure over it
+_CONTOURS = 10
 
 
 def band(piece: Piece, u_samples: FloatArray, u: FloatArray) -> FloatArray:
@@ -117,6 +119,79 @@ def opening_figure(data: Identified) -> Figure | None:
     words = f'Power against the valve opening at {middle:.3g} MPa.'
     layout = {'xaxis': plot.axis('valve opening (%)'), 'yaxis': plot.axis('generated power (MW)')}
     return Figure('opening', caption, words, traces, layout, height=360)
+
+
+def surface_figure(data: Identified) -> Figure | None:
+    """Return the power over opening and pressure with the residuals of the special segments.
+
+    None if the pressure hardly moves, or there are too few segments.
+    """
+    c = data.characteristic
+    found = segment_residuals(c, data.segments)
+    middles = {(s.start_ns + s.end_ns) // 2: s for s in data.segments}
+    chosen = [middles[t] for t in found.time_ns.tolist()]
+    opening = np.array([0.5 * (s.opening_start_percent + s.opening_end_percent) for s in chosen])
+    pressure = np.array([0.5 * (s.pressure_start_mpa + s.pressure_end_mpa) for s in chosen])
+    known = np.isfinite(opening) & np.isfinite(pressure)
+    opening, pressure, residual = opening[known], pressure[known], found.residual_mw[known]
+    if len(residual) < _LEAST:
+        return None
+    low, middle, high = np.quantile(pressure, (0.02, 0.5, 0.98))
+    if high - low < _PRESSURE_MOVES * middle:
+        return None
+    p = np.linspace(float(pressure.min()), float(pressure.max()), _OPENINGS)
+    widest = float(opening.min()), float(opening.max())
+    traces, names = [], []
+    for power in _round_levels(c.power(opening, pressure)):
+        v = c.opening(power, p)
+        v[(v < widest[0]) | (v > widest[1])] = np.nan
+        if np.isfinite(v).sum() < 2:
+            continue
+        name = f'{power:g} MW'
+        at = int(np.flatnonzero(np.isfinite(v))[-1])
+        traces.append(
+            plot.line(plot.rounded(v), plot.rounded(p), name, 'muted', width=1.2, showlegend=False)
+        )
+        names.append({
+            'text': name, 'x': float(v[at]), 'y': float(p[at]), 'showarrow': False,
+            'xanchor': 'left', 'yshift': 9, 'font': {'color': plot.token('muted')},
+        })  # fmt: skip
+    largest = max(float(np.quantile(np.abs(residual), 0.98)), 1e-3)
+    traces.append(plot.points(
+        plot.rounded(opening), plot.rounded(pressure), 'special segments', 'data',
+        'opening %{x:.3~g} %<br>%{y:.3~g} MPa<br>%{marker.color:+.3~g} MW<extra></extra>',
+        size=7, showlegend=False,
+        marker={
+            'color': plot.rounded(residual, 3), 'cmin': -largest, 'cmax': largest,
+            'colorscale': [[0.0, plot.token('chosen')], [0.5, plot.token('grid')],
+                           [1.0, plot.token('steady')]],
+            'colorbar': {'title': {'text': 'MW'}},
+            'line': {'color': plot.token('data'), 'width': 0.5},
+        },
+    ))  # fmt: skip
+    layout: Spec = {
+        'xaxis': plot.axis('valve opening (%)'), 'yaxis': plot.axis('main steam pressure (MPa)'),
+        'annotations': names,
+    }  # fmt: skip
+    caption = (
+        '<b>Both colours should be mixed everywhere.</b> The lines are the power of the curve '
+        'over opening and pressure. Each dot is a special segment; its colour is measured less '
+        'curve. A region of one colour: there the curve, or its form, is off.'
+    )
+    words = (
+        f'Power over opening and pressure, and the residuals of '
+        f'{say.counted(len(residual), "segment")}; they spread by '
+        f'{say.plain(float(np.std(residual)), 2)} MW.'
+    )
+    return Figure('surface', caption, words, traces, layout, height=440)
+
+
+def _round_levels(power: FloatArray) -> list[float]:
+    """Return about eight round numbers in the range of a power."""
+    low, high = float(np.nanmin(power)), float(np.nanmax(power))
+    step = 10.0 ** math.floor(math.log10(max(high - low, 1e-6) / _CONTOURS))
+    step *= next(k for k in (1.0, 2.0, 5.0, 10.0) if (high - low) / (k * step) <= _CONTOURS)
+    return [float(v) for v in step * np.arange(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _caption(data: Identified) -> str:

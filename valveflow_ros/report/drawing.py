@@ -212,6 +212,14 @@ def _marks(pane: Any, layout: Spec, x: str, y: str) -> None:
         else:
             style = ':' if shape['line'].get('dash') else '-'
             pane.axvline(shape['x0'] / unit, color=shape['line']['color'], linestyle=style)
+    for note in layout.get('annotations', []):
+        if (note.get('xref', 'x'), note.get('yref', 'y')) == (x, y):
+            pane.annotate(
+                plain_text(note['text']), (note['x'] / unit, note['y']),
+                ha=note.get('xanchor', 'center'), va='center',
+                xytext=(0, note.get('yshift', 0) * _POINTS), textcoords='offset points',
+                color=note.get('font', {}).get('color'), size='small',
+            )  # fmt: skip
 
 
 def _draw(pane: Any, trace: Spec, date: bool) -> None:
@@ -258,7 +266,13 @@ def _scatter(pane: Any, trace: Spec, x: FloatArray, y: Any, label: str) -> None:
         pane.plot(x, y, **look)
         sizes = size if isinstance(size, list) else [size] * len(x)
         shades = colour if isinstance(colour, list) else [colour] * len(x)
-        pane.scatter(x, y, s=[(v * _POINTS) ** 2 for v in sizes], c=shades, zorder=3)
+        more: dict[str, Any] = {}
+        if scale := marker.get('colorscale'):
+            more = {'vmin': marker['cmin'], 'vmax': marker['cmax'], 'cmap': _shades(scale)}
+        dots = [(v * _POINTS) ** 2 for v in sizes]
+        drawn = pane.scatter(x, y, s=dots, c=shades, zorder=3, **more)
+        if more:
+            pane.figure.colorbar(drawn, ax=pane, label=marker['colorbar']['title']['text'])
         return
     look |= {
         'marker': _SIGNS.get(sign, 'o'), 'markersize': size * _POINTS,
@@ -277,24 +291,27 @@ def _scatter(pane: Any, trace: Spec, x: FloatArray, y: Any, label: str) -> None:
 
 
 def _heat(pane: Any, trace: Spec, x: FloatArray) -> None:
-    from matplotlib.colors import LinearSegmentedColormap
-
     cells = np.array([[np.nan if v is None else v for v in row] for row in trace['z']])
     rows, across = cells.shape
     given = column(trace, 'y')
     words = bool(given) and isinstance(given[0], str)
     up = np.asarray(np.arange(rows) if words else given, dtype=np.float64)
-    scale = trace['colorscale']
-    shades: Any = _MAPS.get(scale, scale) if isinstance(scale, str) else (
-        LinearSegmentedColormap.from_list('own', [tuple(step) for step in scale])
-    )  # fmt: skip
     drawn = pane.pcolormesh(
         _edges(x, across), _edges(up, rows), cells, vmin=trace.get('zmin'),
-        vmax=trace.get('zmax'), cmap=shades, rasterized=True,
+        vmax=trace.get('zmax'), cmap=_shades(trace['colorscale']), rasterized=True,
     )  # fmt: skip
     if trace.get('showscale', True):
         title = trace.get('colorbar', {}).get('title', {}).get('text', '')
         pane.figure.colorbar(drawn, ax=pane, label=title)
+
+
+def _shades(scale: Any) -> Any:
+    """Return the colours of a scale, given by its name or by its steps."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    if isinstance(scale, str):
+        return _MAPS.get(scale, scale)
+    return LinearSegmentedColormap.from_list('own', [tuple(step) for step in scale])
 
 
 def _edges(places: FloatArray, count: int) -> FloatArray:

@@ -24,7 +24,13 @@ from valveflow_ros.report.answer import (
     temperature_words,
     window_words,
 )
-from valveflow_ros.report.curve import curve_figure, opening_figure, segments_figure, shift_section
+from valveflow_ros.report.curve import (
+    curve_figure,
+    opening_figure,
+    segments_figure,
+    shift_section,
+    surface_figure,
+)
 from valveflow_ros.report.data import (
     coverage_figure,
     presence_figure,
@@ -57,7 +63,10 @@ def identification_page(data: Identified) -> Page:
         ),
         shift_section(data),
         *history_sections(data.history),
-        html.section('The special segments', signals_figure(data), segments_figure(data)),
+        html.section(
+            'The special segments', signals_figure(data), segments_figure(data),
+            surface_figure(data),
+        ),
         _choice(c),
         _dynamics(c),
         html.section(

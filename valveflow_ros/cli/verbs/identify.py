@@ -42,6 +42,9 @@ def arguments(parser: ArgumentParser) -> None:
         'an extended_model.json of diagnose: its causes are kept fixed, curve and dynamics '
         'are found anew',
     )
+    command.add_covariate(
+        parser, 'the column of a covariate of --model, if this log calls it otherwise'
+    )
     command.add_file(
         parser,
         '--reference',
@@ -63,6 +66,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     # A parameter file of the node may contain a model too.
     found = identify(
         log, parameters=given, model=options.model or given.get('model_file') or None,
+        covariates=command.covariates_of(options),
         reference=options.reference, step_test=options.step_test, progress=console,
     )  # fmt: skip
     console(0.9, 'writing the report')

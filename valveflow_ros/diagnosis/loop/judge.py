@@ -41,6 +41,7 @@ _WINDOW_ROWS = 1000  # the thresholds were determined on windows of 751 rows
 _MOST_FILLED = 3
 _LEAST_LEVELS = 6
 _LEAST_STEP_S = 5.0
+_LEAST_MEANS = 100  # the prediction has 22 coefficients and needs a past of 32 means
 _MOST_AT_STOP, _STOP_RUN = 0.03, 4
 _MOST_FLAT = 0.5
 _TURN = 0.2  # fraction of the usual span of the command that counts as a reversal
@@ -122,6 +123,14 @@ def judge_response(
     if why:
         return LoopJudgement(NOT_JUDGED, why, rows=len(c))
     group = max(1, round(_LEAST_STEP_S / step_s))
+    if len(c) < _LEAST_MEANS * group:
+        return LoopJudgement(
+            NOT_JUDGED,
+            f'The {len(c)} rows with command and process value in one piece last '
+            f'{len(c) * step_s:.3g} s; {_LEAST_MEANS * group * step_s:.0f} s are needed, because '
+            f'a process value is judged by its means over {_LEAST_STEP_S:.0f} s.',
+            rows=len(c),
+        )
     parts = np.array_split(np.arange(len(c)), -(-len(c) // (_WINDOW_ROWS * group)))
     found = [_judged(c[p], y[p], None if aim is None else aim[p], step_s, group) for p in parts]
     if len(found) > 1 and all(one.verdict == NOT_JUDGED for one in found):

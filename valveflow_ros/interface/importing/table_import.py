@@ -252,6 +252,8 @@ class TableImport:
         try:
             notes = reader.notes()
         except RefusedError as error:
+            if not times:
+                raise
             refused.append(error)
         self._time_ns = np.concatenate(times)
         notes += self._sort()

@@ -35,7 +35,7 @@ _LOCAL = {
     **dict.fromkeys(('CST', 'CDT'), 'America/Chicago'),
     **dict.fromkeys(('PST', 'PDT'), 'America/Los_Angeles'),
 }  # fmt: skip
-_PERIOD = '60s'
+PERIOD = '60s'
 _USUAL_DEGC = 540
 _GROUNDS = {
     EXACT: '', words.CLEAR: 'by its name', words.LIKELY: 'by its name', words.TAG: 'by its tag'
@@ -85,12 +85,13 @@ class Matcher:
         return same[0] if same else None
 
     def match(
-        self, wanted: Mapping[Signal, str], spared: Collection[Signal], no_time: bool
+        self, wanted: Mapping[Signal, str], spared: Collection[Signal], no_time: Remedy | None
     ) -> dict[Signal, Chosen]:
         """Return the column of each signal.
 
         ``wanted`` are the columns named by the user, ``spared`` the signals that may be missing;
-        ``no_time`` says that the time is missing. All problems are raised in one `RefusedError`.
+        ``no_time`` is the option to propose if the time is missing. All problems are raised in
+        one `RefusedError`.
         Raises `InputError` if several columns have the same name.
         """
         chosen: dict[Signal, Chosen] = {}
@@ -133,7 +134,7 @@ class Matcher:
             elif info.required and info.signal not in spared:
                 missing.append(info.topic)
         self._propose(missing, several, remedies, chosen)
-        if absent or several or missing or no_time:
+        if absent or several or missing or no_time is not None:
             raise self._refusal(absent, several, missing, remedies, no_time, chosen)
         return chosen
 
@@ -164,10 +165,10 @@ class Matcher:
 
     def _refusal(
         self, absent: Mapping[Signal, str], several: list[str], missing: list[str],
-        remedies: list[Remedy], no_time: bool, chosen: Mapping[Signal, Chosen],
+        remedies: list[Remedy], no_time: Remedy | None, chosen: Mapping[Signal, Chosen],
     ) -> RefusedError:  # fmt: skip
         """Return one error for everything that could not be decided."""
-        times = [TIME] if no_time else []
+        times = [] if no_time is None else [TIME]
         topics = [SIGNALS[s].topic for s in absent] + missing + times
         parts = [*several]
         if topics:
@@ -180,14 +181,14 @@ class Matcher:
             constant = ', or give --constant NAME=VALUE for what hardly changes'
             if cold in missing:
                 constant = f', or the usual temperature with --constant {cold}={_USUAL_DEGC}'
-            apart = f', or say with --period {_PERIOD} how far apart the rows are' if times else ''
+            apart = f', or say with --period {PERIOD} how far apart the rows are' if times else ''
             parts.append(
                 f'{", ".join(told)}; the {self.what}s are: {self._have(chosen)}. Name '
                 f'yours with {options}{constant if missing else ""}{apart}'
             )
-        return RefusedError(
-            self.path, '; '.join(parts), [*remedies, *(_naming(t) for t in topics)]
-        )
+        remedies += [_naming(topic) for topic in topics if topic != TIME]
+        remedies += [] if no_time is None else [no_time]
+        return RefusedError(self.path, '; '.join(parts), remedies)
 
     def missing(self, theirs: str, name: str) -> RefusedError:
         """Return the error for a time column that the user named and that does not exist."""
@@ -201,7 +202,9 @@ class Matcher:
     def _have(self, chosen: Mapping[Signal, Chosen] = MappingProxyType({})) -> str:
         known = {c.place: SIGNALS[signal].topic for signal, c in chosen.items()}
         return ', '.join(
-            f'{name} ({known[k]})' if k in known and name != known[k] else name
+            f'{name} ({known[k]})'
+            if k in known and name != known[k]
+            else name or 'one without a name'
             for k, name in enumerate(self.names[:40])
         )
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valveflow_ros.errors import InputError
 from valveflow_ros.logs.names import signal_of
 from valveflow_ros.logs.tables import cells as cell_values
 from valveflow_ros.logs.tables.cells import Marks, to_numbers, understands
@@ -20,6 +21,7 @@ from valveflow_ros.logs.tables.file import Heading, TableFile, look_at
 from valveflow_ros.logs.tables.match import (
     DATE,
     NAMES_OF_AN_INDEX,
+    PERIOD,
     TIME,
     Chosen,
     Matcher,
@@ -28,9 +30,15 @@ from valveflow_ros.logs.tables.match import (
     time_columns,
     zone_in,
 )
-from valveflow_ros.logs.tables.refusal import AS_SEEN, RefusedError, Remedy, TableOptions
+from valveflow_ros.logs.tables.refusal import (
+    AS_SEEN,
+    THEIRS,
+    RefusedError,
+    Remedy,
+    TableOptions,
+)
 from valveflow_ros.logs.tables.text import decimal_mark
-from valveflow_ros.logs.tables.times import NEVER, RowClock, TimeReader
+from valveflow_ros.logs.tables.times import NEVER, RowClock, TimeReader, as_numbers, is_excel
 from valveflow_ros.logs.tables.words import folded, split_unit
 from valveflow_ros.records import (
     SIGNALS,
@@ -45,6 +53,8 @@ from valveflow_ros.records import (
 if TYPE_CHECKING:
     import pandas as pd
 
+# Numbers below it (2 January 1990 in s) may count the rows.
+_LEAST_UNIX_S = 631_238_400.0
 # Column names in a long table (one row per value), as exported by PI and other historians.
 _TAG = re.compile(
     r'^(?:pi )?(?:tag|point|sensor|item|variable|signal|name|kks|channel)(?: ?(?:name|id))?$|'
@@ -165,7 +175,8 @@ class TableReader:
             )
         counted = bool(options.period) and self.long is None
         spared = {signal_of(name) for name in absent}
-        found = matcher.match(by_signal, spared, no_time=time is None and not counted)
+        no_time = self._without_times() if time is None and not counted else None
+        found = matcher.match(by_signal, spared, no_time)
         self._time = time
         self._chosen: dict[str, Chosen] = {SIGNALS[s].column: found[s] for s in sorted(found)}
         self._quality = {} if self.long is not None else self._quality_places()
@@ -317,11 +328,32 @@ class TableReader:
             return date, None
         # Raises if two columns have this name.
         matcher.find(self._file.names[time])
+        if self._options.period and not named and not self._holds_times(time, date):
+            return None, None
         # A separate date is used only if the time column holds times of day.
         cells = cells_of(self._file, time)
         clock = sum(c.count(':') >= 1 and not any(m in c for m in '-/T') and len(c) <= 15
                     and c.find('.') not in range(5) for c in cells)  # fmt: skip
         return time, (date if date != time and 2 * clock > len(cells) else None)
+
+    def _holds_times(self, time: int, date: int | None) -> bool:
+        """Return False if no sampled cell is a time; numbers may be those of the rows."""
+        import pandas as pd
+
+        cells = time_samples(self._file, time, date)
+        if len(numbers := as_numbers(cells)):
+            return is_excel(numbers) or float(numbers.max()) >= _LEAST_UNIX_S
+        try:
+            clock = TimeReader(cells, str(self.path), self._file.names[time], self._options)
+            return bool((clock.read(pd.Series(cells)) != NEVER).any())
+        except InputError:
+            return True  # an ambiguous time is refused by its own sentence
+
+    def _without_times(self) -> Remedy:
+        """Return the option to propose: the name of a column if one may hold times."""
+        if any(stamps_in(cells_of(self._file, k)) for k in range(len(self._file.names))):
+            return Remedy('column', f'{TIME}={THEIRS}')
+        return Remedy('period', PERIOD)
 
     def _index_of_times(self) -> int | None:
         """Return the unnamed column that holds times, as pandas writes an index."""

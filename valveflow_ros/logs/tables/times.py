@@ -377,6 +377,7 @@ class TimeReader:
         zone: str = '',
     ) -> None:  # fmt: skip
         self.where = f"{where}: the column '{name}'"
+        self._file, self._name = where, name
         self.zone = options.time_zone or zone
         self.notes: list[str] = []
         self.any_time = False
@@ -431,9 +432,12 @@ class TimeReader:
         Raises `InputError` if no value was a time, or they go back by an hour as local times do.
         """
         if not self.any_time:
-            raise InputError(
-                f'{self.where} holds no time; it must be a date with a time of day, or Unix '
-                'seconds, or name another with --column time=THEIRS.'
+            raise RefusedError(
+                self._file,
+                f"the column '{self._name}' holds no time; it must be a date with a time of day, "
+                'or Unix seconds: name another with --column time=THEIRS, or say with --period '
+                '60s how far apart the rows are',
+                [Remedy('period', '60s')],
             )
         if 0 < len(self._set_back) <= _FEW and not self._other_steps_back:
             when = np.datetime64(self._set_back[0], 'ns').astype('datetime64[s]')
