@@ -27,7 +27,8 @@ ByteArray = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
 
 NS_PER_S = 1_000_000_000
-COARSE_STEP_S = 20.0  # rows as far apart or farther hide times shorter than their step
+# Rows as far apart or farther hide times shorter than their step; messages count them in rows.
+COARSE_STEP_S = 20.0
 
 
 class Signal(enum.IntEnum):

@@ -71,6 +71,7 @@ SEEDS = range(6)
 def test_curve_dynamics_and_level_are_recovered_within_their_errors(seed):
     result = refined(seed)
     assert (result.model.pieces, result.model.regions) == (3, 2)
+    assert result.long_s == 0.0  # fast movements fit as well as slow ones
     assert np.abs(deviations(result)).max() < 4.5
     assert result.model.levels == pytest.approx([190.0], abs=1.5)
     assert result.model.time_constants == pytest.approx([5.0, 20.0], rel=0.15)

@@ -27,9 +27,9 @@ from valveflow_ros.fit.step_test import (
     pieces_of_line,
     tested_data,
 )
-from valveflow_ros.fit.task import COARSE_STEP_S
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
+    COARSE_STEP_S,
     BoolArray,
     FloatArray,
     IntArray,

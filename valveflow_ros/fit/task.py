@@ -11,7 +11,7 @@ import numpy as np
 from valveflow_ros.curve.characteristic import HeldCause, Piece
 from valveflow_ros.errors import DataError, TooFewSamplesError, counted
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.records import COARSE_STEP_S, FloatArray, IntArray
 from valveflow_ros.segments.window import WindowContents
 from valveflow_ros.signals.static_form import StaticForm
 
@@ -48,7 +48,6 @@ class FitTask:
 
 # Windows that do not determine a curve, with advice in the messages.
 
-COARSE_STEP_S = 20.0  # from this step on, messages state minimum durations in rows
 _EXPLAINED_LEAST = 0.5  # minimum fraction of the power's variance that a curve must explain
 _ONE_LEVEL_PERCENT = 2.0  # of opening: a smaller range is a single load with noise
 _LEAST_SPREAD = 10.0  # minimum range of the openings, in noise sd

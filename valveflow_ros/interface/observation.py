@@ -24,7 +24,7 @@ from valveflow_ros.errors import (
     counted,
 )
 from valveflow_ros.fit.fit import fit, form_contradicted, form_of_data, outline
-from valveflow_ros.fit.task import COARSE_STEP_S, FitTask
+from valveflow_ros.fit.task import FitTask
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.logs import Log, Series, read_covariate
 from valveflow_ros.interface.plausibility import selected
@@ -36,6 +36,7 @@ from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.numerics import read_ahead
 from valveflow_ros.parameters import Settings, covariate_columns
 from valveflow_ros.records import (
+    COARSE_STEP_S,
     NS_PER_S,
     SIGNALS,
     IntArray,
