@@ -370,9 +370,9 @@ def _long_means(
     while length > 2.0 * samples.step_s:
         long = samples.slower(length)
         problem = Problem(long)
-        means = int(problem.answer(model)[1].sum())
+        before, weight = problem.answer(model)
+        means = int(weight.sum())
         if means >= _LONG_EACH * free.sum() and means * length >= _LONG_SHARE * rows:
-            before, weight = problem.answer(model)
             ar = fit_ar(before, weight)
             trial, _ = move(problem, model, ar, _of_curve(model, free), 3)
             change = (problem.answer(trial)[0] - before)[weight > 0]
