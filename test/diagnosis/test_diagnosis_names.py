@@ -22,7 +22,6 @@ from diagnosis_records import (
 from streams import needs_jit
 
 from valveflow_ros.diagnosis.diagnose import diagnose
-from valveflow_ros.diagnosis.evidence import Gain
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.unit import Noise, Programme
 from valveflow_ros.records import SampleTable, Signal
@@ -253,16 +252,3 @@ def test_a_record_in_which_nothing_moves_is_refused():
     still = SampleTable(samples.time_ns, values, samples.quality)
     with pytest.raises(DataError, match='hardly moves'):
         diagnose(record(still), rough_model())
-
-
-@needs_jit
-def test_a_cause_that_raises_the_error_on_sealed_blocks_is_not_named(monkeypatch):
-    samples = table(SHORT, 1, ('temperature:k=-0.0016',), unit())
-    assert names(diagnose(record(samples), rough_model())) == {'temperature'}
-    worse = Gain(1.0, 1.01, 1e-4)
-    monkeypatch.setattr(
-        'valveflow_ros.diagnosis.diagnose.gains_of', lambda _, models: [worse] * (len(models) - 1)
-    )
-    found = diagnose(record(samples), rough_model())
-    assert 'temperature' not in names(found)
-    assert dict(found.rejected)['temperature'].startswith('it makes the error on blocks')

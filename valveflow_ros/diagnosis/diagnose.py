@@ -73,25 +73,16 @@ def confirm(found: SearchResult) -> None:
     while found.model.active:
         gains = gains_of(found, steps(found))
         worst = max(range(len(gains)), key=lambda k: gains[k].p_value)
-        why = _NOT_CONFIRMED.format(gains[worst].p_value)
         if gains[worst].p_value <= LARGEST_P:
-            # The test whitens the residual; with slow noise the plain error may rise all the same.
-            worst = min(range(len(gains)), key=lambda k: gains[k].reduction)
-            if gains[worst].reduction > 0.0:
-                return
-            why = _WORSE
+            return
         name = found.model.active[worst].name
         found.model, _ = improve(found.task, found.model.without(name), 3)
         found.near.pop(name, None)
         found.evidence.pop(name, None)
-        found.reasons[name] = why
-
-
-_NOT_CONFIRMED = (
-    'blocks of time that were kept out of the search do not confirm it (a gain as large there has '
-    'a chance of {:.2g})'
-)
-_WORSE = 'it makes the error on blocks of time that were kept out of the search larger'
+        found.reasons[name] = (
+            'blocks of time that were kept out of the search do not confirm it (a gain as large '
+            f'there has a chance of {gains[worst].p_value:.2g})'
+        )
 
 
 def steps(found: SearchResult) -> list[Extended]:
