@@ -1,6 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that a historian stores by exception: until the next value, little has changed.
+"""Signals that a historian stores by exception: each value is valid until the next one.
 
 Such a historian stores a value if it differs by more than a dead band from the last stored one,
 or if that one is too old. The time steps are therefore irregular and changes are never small.
@@ -96,8 +96,8 @@ class Compression:
         )
         longest_min = _LATE * self.longest_s / 60.0
         how = (
-            f'Between two values, up to {longest_min:.0f} min apart, a signal is taken as a '
-            f'straight line within that change of the first one, in rows {self.step_s:g} s apart.'
+            f'Each value is held until the next one, for up to {longest_min:.0f} min, in rows '
+            f'{self.step_s:g} s apart.'
             if self.own_times
             else 'Its rows repeat each value until the next one.'
         )
@@ -187,20 +187,17 @@ def _updates(gap_s: FloatArray, value: FloatArray, longest_s: float, held: bool)
 
 
 def held_readings(readings: Readings, compression: Compression) -> Readings:
-    """Return a compressed log as rows of equal steps.
+    """Return a compressed log as rows in which each value is repeated until the next one.
 
-    The next value was stored when the signal had left the dead band of this one: until then it
-    was within the band (interval censoring). A straight line to the next value, cut off at the
-    band, is right for a ramp. Signals that are not compressed are held. A value is valid for 1.1
-    times the longest regular interval; rows without a value are left out. A value marked as bad
-    by the sender ends the previous one; NaN means no new value.
+    A value is valid for 1.1 times the longest regular interval; rows without a value are left
+    out. A value marked as bad by the sender ends the previous one; NaN means no new value.
     """
     step_ns = round(compression.step_s * NS_PER_S)
     longest_ns = round(_LATE * compression.longest_s * NS_PER_S)
     first, last = int(readings.time_ns.min()), int(readings.time_ns.max())
     grid = np.arange(-(-first // step_ns), last // step_ns + 1, dtype=np.int64) * step_ns
     parts = [
-        _held(part, grid, longest_ns, compression.updates.get(Signal(s)))
+        _held(part, grid, longest_ns)
         for s, part in sorted(
             readings.by_signal().items(), key=lambda item: SIGNALS[item[0]].required
         )
@@ -215,7 +212,7 @@ def held_readings(readings: Readings, compression: Compression) -> Readings:
     )
 
 
-def _held(part: Readings, grid: IntArray, longest_ns: int, updates: Updates | None) -> Readings:
+def _held(part: Readings, grid: IntArray, longest_ns: int) -> Readings:
     new = np.flatnonzero(np.isfinite(part.value))
     time_ns, value, quality = part.time_ns[new], part.value[new], part.quality[new]
     at = np.searchsorted(time_ns, grid, side='right') - 1
@@ -223,14 +220,6 @@ def _held(part: Readings, grid: IntArray, longest_ns: int, updates: Updates | No
     if not len(new):
         return part.part(0, 0)
     good: BoolArray = known & (grid - time_ns[at] <= longest_ns) & (quality[at] < Quality.BAD)
-    shown = value[at]
-    if updates is not None:
-        after = np.minimum(at + 1, len(new) - 1)
-        span = time_ns[after] - time_ns[at]
-        toward = (span > 0) & (span <= longest_ns) & (quality[after] < Quality.BAD)
-        share = np.where(toward, (grid - time_ns[at]) / np.maximum(span, 1), 0.0)
-        change = share * (value[after] - shown)
-        shown = shown + np.clip(change, -updates.dead_band, updates.dead_band)
     return Readings(
-        grid[good], np.full(int(good.sum()), part.signal[0]), shown[good], quality[at[good]]
+        grid[good], np.full(int(good.sum()), part.signal[0]), value[at[good]], quality[at[good]]
     )
