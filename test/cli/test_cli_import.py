@@ -62,15 +62,6 @@ def test_columns_are_converted_and_told(run, tmp_path, history):
     assert told['signals'][0]['written_unit'] == 'fraction'
 
 
-def test_a_sum_of_columns_becomes_the_opening_of_the_log(run, tmp_path, write_csv):
-    lines = [f'{row},{0.3 + 0.001 * k}' for k, row in enumerate(rows())]
-    table, log = write_csv(f'{HEADER},C V2', lines), tmp_path / 'x.mcap'
-    options = ['valve_opening=1*CV+3*C V2:fraction' if 'CV' in o else o for o in OPTIONS]
-    ran = run('import', table, '-o', log, *options).done()
-    assert np.allclose(values(log, Signal.VALVE_OPENING), 35.0 + 0.1 * np.arange(50))
-    assert 'Not used: Spare.\n' in ran.out
-
-
 def test_constants_stand_in_every_row(run, tmp_path, history):
     log = tmp_path / 'x.mcap'
     words = [*OPTIONS[:4], *OPTIONS[8:], '--constant', 'main_steam_pressure=120:bar',

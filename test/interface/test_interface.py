@@ -132,37 +132,11 @@ class TestLog:
         marks = there.to_dataframe()['valve_opening_percent_quality']
         assert marks.tolist() == [0, 1] * 500
 
-    def test_a_sum_of_columns_is_the_same_opening_in_a_file_and_a_dataframe(
-        self, simulation, tmp_path
-    ):
-        frame = simulation.to_dataframe().head(1000)
-        frame['GV1'], frame['GV2'] = np.arange(1000) / 10.0, 50.0
-        frame['valve_command_percent'] = 1.0
-        frame.loc[3, 'GV1'] = np.nan
-        frame.to_parquet(tmp_path / 'a.parquet')
-        said = {'valve_opening': '0.03*GV1+0.01*GV2:percent'}
-        for source in (frame, tmp_path / 'a.parquet'):
-            back = vf.open_log(source, columns=said).to_dataframe()
-            want = 0.75 * frame['GV1'] + 12.5
-            np.testing.assert_allclose(back['valve_opening_percent'], want)
-            assert 'valve_command_percent' not in back
-        marked = vf.open_log(
-            frame.assign(GV1_quality=np.uint8(0), GV2_quality=np.uint8([0, 1] * 500)), columns=said
-        )
-        codes = [0, 1, 0, 2, *[0, 1] * 498]  # no value counts as bad
-        assert marked.to_dataframe()['valve_opening_percent_quality'].tolist() == codes
-        named = {**said, 'valve_command': 'GV2'}
-        assert (
-            vf.open_log(frame, columns=named).to_dataframe()['valve_command_percent'] == 50
-        ).all()
-
     @pytest.mark.parametrize(
         ('change', 'options', 'error', 'part'),
         [
             ({'time': None}, {}, DataError, 'no row with a time'),
             ({}, {'columns': {'valve_opening': 'V'}}, InputError, "no column 'V'"),
-            ({}, {'columns': {'valve_opening': 'valve_command_percent+V'}}, InputError,
-             "no column 'V'; it has: time, valve_opening_percent"),
             ({}, {'columns': {'valve_openin': 'V'}}, UsageError, "did you mean 'valve_opening'"),
             ({}, {'columns': {'generated_power': 'generated_power_mw:stone'}}, InputError,
              "Unit 'stone'"),

@@ -268,20 +268,6 @@ def test_columns_by_other_names(tmp_path):
             'no column was recognised as time; .*--column time=THEIRS, or say with --period ',
         ),
         ('time,a,a ', {'valve_opening': 'a'}, "several columns called 'a'"),
-        (
-            'time,a,b,MW',
-            {'valve_opening': 'a+c'},
-            "no column 'c'.*the columns are: time, a, b, MW",
-        ),
-        ('time,a,b,MW', {'valve_opening': '-1*a+2*b'}, r"'-1\*a' is not .* positive weight"),
-        ('time,a,b,MW', {'valve_opening': 'nan*a+2*b'}, r"'nan\*a' is not .* positive weight"),
-        ('time,a,b,MW', {'valve_opening': 'half*a+2*b'}, r"'half\*a' is not .* positive weight"),
-        ('time,a,b,MW', {'valve_opening': 'a+'}, "'' is not a column with a positive weight"),
-        ('time,a,b,MW', {'valve_opening': 'a+2*b'}, 'some of its columns have no weight'),
-        ('time,a,b,MW', {'valve_opening': 'a+b+a'}, 'a column is in it twice'),
-        ('time,a [%],b [p.u.],MW', {'valve_opening': 'a+b'}, 'different units: % and fraction'),
-        ('time,a,b,MW', {'generated_power': 'a+b'}, 'a sum is for valve_opening only'),
-        ('tag,time,value', {'valve_opening': '1+1'}, 'needs a column for each signal'),
     ],
 )
 def test_a_missing_or_ambiguous_column_is_one_sentence_with_the_cure(
@@ -289,45 +275,6 @@ def test_a_missing_or_ambiguous_column_is_one_sentence_with_the_cure(
 ):
     with pytest.raises(InputError, match=match):
         read(tmp_path, '1,2,3,4'[: head.count(',') * 2 + 1], head=head, columns=columns)
-
-
-WEIGHTED = (
-    'time,GV1 [%],GV1 Status,GV2 [%],A+B,MS pressure [MPa],MS temperature,MW,valve_command [%]'
-)
-
-
-@pytest.mark.parametrize(
-    ('text', 'expected'),
-    [
-        ('0.6*GV1+0.2*GV2', [85.0, 70.0, np.nan, 75.0]),
-        ('3 * GV1 [%] + 1*GV2', [85.0, 70.0, np.nan, 75.0]),
-        ('GV1+GV2', [70.0, 40.0, np.nan, 50.0]),
-        ('A+B', [7.0, 8.0, 9.0, 10.0]),
-    ],
-)
-def test_the_opening_may_be_a_weighted_sum_of_columns(tmp_path, text, expected):
-    cells = ('100,Good,40,7', '100,Good,-20,8', '100,Good,,9', '100,Bad,0,10')
-    rows = [f'{1700000000 + 60 * k},{four},13,538,200,55' for k, four in enumerate(cells)]
-    raw = read(tmp_path, *rows, head=WEIGHTED, columns={'valve_opening': text})
-    np.testing.assert_allclose(raw.columns[OPENING], expected, rtol=1e-14)
-    summed = 'GV1' in text
-    assert raw.names[OPENING] == text
-    assert raw.units.get(OPENING) == ('%' if summed else None)
-    assert [codes.tolist() for codes in raw.quality.values()] == [[0, 0, 0, 2]] * summed
-    # A set point is in the scale of a single column only.
-    assert ('valve_command [%]' in raw.ignored) == summed
-
-
-def test_a_sum_reads_decimal_commas_and_worst_quality(tmp_path):
-    head = WEIGHTED.replace(',', ';').replace('A+B', 'GV2 Status')
-    rows = [
-        '1700000000;50,5;Good;30,5;Bad;13;538;200;1',
-        '1700000060;50,5;Questionable;1;Good;13;538;2;1',
-    ]
-    raw = read(tmp_path, *rows, head=head, columns={'valve_opening': 'GV1+GV2'})
-    assert raw.columns[OPENING].tolist() == [40.5, 25.75]
-    assert raw.quality[OPENING].tolist() == [Quality.BAD, Quality.UNCERTAIN]
-    assert "read from 'GV1 Status' and 'GV2 Status', by which 1 of its" in ' '.join(raw.notes)
 
 
 def test_the_only_column_in_a_unit_of_a_missing_signal_is_proposed(tmp_path):

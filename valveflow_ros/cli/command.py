@@ -253,8 +253,7 @@ def add_mapping(parser: ArgumentParser) -> None:
     parser.add_argument(
         '--column', action='append', default=[], metavar='NAME=THEIRS[:UNIT]',
         help='your column or topic for the signal NAME, and its unit if it is not the '
-        'usual one; may be given several times. Of valves in sequence the opening is the sum of '
-        "their positions by flow area: 'valve_opening=0.6*GV1+0.4*GV2' (tables only)",
+        'usual one; may be given several times',
     )  # fmt: skip
     parser.add_argument(
         '--constant', action='append', default=[], metavar='NAME=VALUE[:UNIT]',

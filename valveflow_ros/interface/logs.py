@@ -19,7 +19,7 @@ from valveflow_ros.interface.mapping import LOOKING_ON, LogMapping, gather_refus
 from valveflow_ros.interface.plausibility import Doubt
 from valveflow_ros.logs import LogContents
 from valveflow_ros.logs import open_log as read_file
-from valveflow_ros.logs.names import signal_of, weights_of
+from valveflow_ros.logs.names import signal_of
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
 from valveflow_ros.logs.tables.match import TIME
@@ -256,8 +256,7 @@ def open_log(
         All of the following in one object.
     columns : mapping of str to str, optional
         Name of a signal in the log and its unit: ``{'main_steam_pressure':
-        'PT_100:bar'}``. Columns of a table with a recognisable name need not be given. The
-        opening may be a weighted sum: ``{'valve_opening': '0.6*GV1+0.4*GV2'}``.
+        'PT_100:bar'}``. Columns of a table with a recognisable name need not be given.
     constants : mapping, optional
         Signals that were not logged: ``{'main_steam_temperature': 540}``.
     time_zone, date_order, decimal, sheet : str
@@ -556,14 +555,8 @@ def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
     """Return a DataFrame as a log; raises `InputError` or `DataError`."""
     import pandas as pd
 
-    total = names.get(SIGNALS[Signal.VALVE_OPENING].topic, '')
-    weights = weights_of(total) if '+' in total and total not in frame.columns else {}
-    wanted = {*names.values(), *weights} - ({total} if weights else set())
-    if missing := sorted(wanted - {*frame.columns}):
-        has = ', '.join(map(str, frame.columns[:40]))
-        raise InputError(f"The DataFrame has no column '{missing[0]}'; it has: {has}.")
-    if weights:
-        frame = frame.assign(**_weighted(frame, total, weights))
+    if missing := [theirs for theirs in names.values() if theirs not in frame.columns]:
+        raise InputError(f"The DataFrame has no column '{missing[0]}'.")
     theirs = names.get(TIME, TIME)
     if theirs not in frame.columns and not isinstance(frame.index, pd.DatetimeIndex):
         raise InputError("The DataFrame has no column 'time', and its index holds no times.")
@@ -571,9 +564,7 @@ def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
     order = np.flatnonzero(there)[np.argsort(time_ns[there], kind='stable')]
     columns, quality, signals = {}, {}, {}
     for info in SIGNALS:
-        # The command is not in the scale of a sum, so it counts only if it is named.
-        alone = weights and info.signal == Signal.VALVE_COMMAND
-        usual = () if alone else (info.column, info.topic)
+        usual = (info.column, info.topic)
         theirs = names.get(info.topic) or next((c for c in usual if c in frame.columns), '')
         if not theirs:
             continue
@@ -593,16 +584,6 @@ def _from_dataframe(frame: Any, names: Mapping[str, str]) -> LogContents:
         'DataFrame', readings, readings.time_ns, signals=signals,
         start_ns=int(table.time_ns[0]), end_ns=int(table.time_ns[-1]),
     )  # fmt: skip
-
-
-def _weighted(frame: Any, total: str, weights: Mapping[str, float]) -> dict[str, Any]:
-    """Return the weighted sum of columns, and the worst of their qualities, by its column name."""
-    import pandas as pd
-
-    parts = [w * pd.to_numeric(frame[name], errors='coerce') for name, w in weights.items()]
-    found = {total: sum(parts[1:], parts[0])}
-    codes = [frame[n + QUALITY_SUFFIX] for n in weights if n + QUALITY_SUFFIX in frame.columns]
-    return found | ({total + QUALITY_SUFFIX: np.max(codes, axis=0)} if codes else {})
 
 
 def nanoseconds(times: Any) -> tuple[IntArray, BoolArray]:

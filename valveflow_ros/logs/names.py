@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 
@@ -37,37 +36,6 @@ def signal_of(name: str) -> Signal:
         known = ', '.join(info.column for info in SIGNALS)
         raise InputError(f"There is no signal '{name}'; there are {known}.")
     return _BY_NAME[name]
-
-
-def weights_of(text: str) -> dict[str, float]:
-    """Return the columns of a weighted sum, such as ``0.6*GV1+0.4*GV2``, and their weights.
-
-    The weights are divided by their total, so that the sum keeps the unit of its columns. Without
-    weights all are equal. Raises `InputError` if the text is no such sum.
-    """
-
-    def refused(problem: str) -> InputError:
-        return InputError(
-            f"valve_opening='{text}': {problem}; write such a sum as 0.6*GV1+0.4*GV2, with a "
-            'positive weight for each column, or as GV1+GV2.'
-        )
-
-    found: dict[str, float] = {}
-    parts = text.split('+')
-    for part in parts:
-        weight, _, name = (word.strip() for word in part.rpartition('*'))
-        try:
-            found[name] = float(weight or 1.0)
-        except ValueError:
-            found[name] = math.nan
-        if not name or not 0.0 < found[name] < math.inf:
-            raise refused(f"'{part.strip()}' is not a column with a positive weight")
-    if len(found) < len(parts):
-        raise refused('a column is in it twice')
-    if len({'*' in part for part in parts}) > 1:
-        raise refused('some of its columns have no weight')
-    total = sum(found.values())
-    return {name: weight / total for name, weight in found.items()}
 
 
 def last_part(topic: str) -> str:
@@ -169,10 +137,9 @@ def _present(wanted: str, name: str, type_name: str, types: Mapping[str, str], p
             raise RecordingError(path, problem)
         return topic
     have = ', '.join(sorted(types)) or 'none'
-    tables = ' Only columns of a table can be added up.' if '+' in wanted else ''
     raise InputError(
         f"{path}: there is no topic '{wanted}' for {name}; the topics are: {have}. "
-        f'Choose with --column {name}=TOPIC.{tables}'
+        f'Choose with --column {name}=TOPIC.'
     )
 
 

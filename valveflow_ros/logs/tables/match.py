@@ -12,7 +12,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 from valveflow_ros.errors import InputError, listed
-from valveflow_ros.logs.names import weights_of
 from valveflow_ros.logs.tables import words
 from valveflow_ros.logs.tables.file import Heading
 from valveflow_ros.logs.tables.refusal import THEIRS, RefusedError, Remedy
@@ -47,15 +46,13 @@ _GROUNDS = {
 class Chosen:
     """A column chosen for a signal: its index from 0, its name and its unit in the file.
 
-    ``ground`` is the reason for the choice; empty if the name is exact or given by the user. A
-    weighted sum has several ``places`` and a weight for each; ``theirs`` is its text.
+    ``ground`` is the reason for the choice; empty if the name is exact or given by the user.
     """
 
-    places: tuple[int, ...]
+    place: int
     theirs: str
     unit: Spelling | None = None
     ground: str = ''
-    weights: tuple[float, ...] = (1.0,)
 
 
 class Matcher:
@@ -100,21 +97,20 @@ class Matcher:
         chosen: dict[Signal, Chosen] = {}
         absent: dict[Signal, str] = {}
         for signal, theirs in wanted.items():
-            found = self._named(signal, theirs)
-            if isinstance(found, Chosen):
-                chosen[signal] = found
+            place = self.find(theirs)
+            if place is None:
+                absent[signal] = theirs
             else:
-                absent[signal] = found
-        settled = {*chosen, *absent}
-        if any(len(c.places) > 1 for c in chosen.values()):
-            # The command is not in the scale of a sum; with it a sound actuator looks faulty.
-            settled.add(Signal.VALVE_COMMAND)
-        marked = self._marked({k for c in chosen.values() for k in c.places})
+                unit = self.unit_of(place)
+                if signal == Signal.GENERATED_POWER:
+                    unit = unit or words.flow_spelled(self._units[place])
+                chosen[signal] = Chosen(place, self.names[place], unit)
+        marked = self._marked({c.place for c in chosen.values()})
         several: list[str] = []
         missing: list[str] = []
         remedies: list[Remedy] = []
         for info in SIGNALS:
-            if info.signal in settled:
+            if info.signal in chosen or info.signal in absent:
                 continue
             mark = max((m[info.signal] for m in marked if info.signal in m), default=0.0)
             best = [k for k, m in enumerate(marked) if m.get(info.signal) == mark]
@@ -124,8 +120,7 @@ class Matcher:
             if len(best) == 1:
                 ground = _GROUNDS.get(mark, 'by its unit alone')
                 place = best[0]
-                unit = self.unit_of(place)
-                chosen[info.signal] = Chosen((place,), self.names[place], unit, ground)
+                chosen[info.signal] = Chosen(place, self.names[place], self.unit_of(place), ground)
             elif best and mark == EXACT:
                 raise InputError(
                     f"{self.path}: there are several {self.what}s called '{self.names[best[0]]}'."
@@ -142,32 +137,6 @@ class Matcher:
         if absent or several or missing or no_time is not None:
             raise self._refusal(absent, several, missing, remedies, no_time, chosen)
         return chosen
-
-    def _named(self, signal: Signal, theirs: str) -> Chosen | str:
-        """Return the column or weighted sum that the user named, or the name that is not there.
-
-        Raises `InputError` if the weights are wrong or the columns have different units.
-        """
-        place = self.find(theirs)
-        if place is not None:
-            unit = self.unit_of(place)
-            if signal == Signal.GENERATED_POWER:
-                unit = unit or words.flow_spelled(self._units[place])
-            return Chosen((place,), self.names[place], unit)
-        # The values of a long table have no common rows.
-        if '+' not in theirs or signal != Signal.VALVE_OPENING or self.what != 'column':
-            return theirs
-        weights = weights_of(theirs)
-        places = [(name, self.find(name)) for name in weights]
-        if missing := [name for name, place in places if place is None]:
-            return missing[0]
-        found = tuple(place for _, place in places if place is not None)
-        units = {u.unit: u for u in map(self.unit_of, found) if u is not None}
-        if len(units) > 1:
-            told = f"the columns of '{theirs}' have different units: {listed(list(units))}"
-            raise InputError(f'{self.path}: {told}.')
-        unit = next(iter(units.values()), None)
-        return Chosen(found, theirs, unit, weights=tuple(weights.values()))
 
     def _propose(
         self, missing: list[str], several: list[str], remedies: list[Remedy],
@@ -186,7 +155,7 @@ class Matcher:
 
     def _only_in_unit_of(self, signal: Signal, chosen: Mapping[Signal, Chosen]) -> str | None:
         """Return the only unused column with a unit of the signal; None if not exactly one."""
-        taken = {*self._taken, *(k for c in chosen.values() for k in c.places)}
+        taken = {*self._taken, *(c.place for c in chosen.values())}
         found = [
             name for k, name in enumerate(self.names)
             if k not in taken and name and (unit := self.unit_of(k)) is not None
@@ -204,10 +173,6 @@ class Matcher:
         parts = [*several]
         if topics:
             told = [f"there is no {self.what} '{theirs}'" for theirs in absent.values()]
-            if any('+' in theirs for theirs in absent.values()):
-                told[-1] += (
-                    ' (a sum is for valve_opening only, and needs a column for each signal)'
-                )
             if unknown := listed(missing + times, 'or'):
                 told.append(f'no {self.what} was recognised as {unknown}')
             unit = '' if topics == [TIME] else '[:unit]'
@@ -235,7 +200,7 @@ class Matcher:
         )
 
     def _have(self, chosen: Mapping[Signal, Chosen] = MappingProxyType({})) -> str:
-        known = {k: SIGNALS[signal].topic for signal, c in chosen.items() for k in c.places}
+        known = {c.place: SIGNALS[signal].topic for signal, c in chosen.items()}
         return ', '.join(
             f'{name} ({known[k]})'
             if k in known and name != known[k]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from valveflow_ros.errors import InputError, listed
+from valveflow_ros.errors import InputError
 from valveflow_ros.logs.names import signal_of
 from valveflow_ros.logs.tables import cells as cell_values
 from valveflow_ros.logs.tables.cells import Marks, to_numbers, understands
@@ -182,8 +182,7 @@ class TableReader:
         self._quality = {} if self.long is not None else self._quality_places()
         self._marks = self._decided_marks()
         self._clock = RowClock(options) if time is None else self._time_reader(time)
-        used = {k for c in self._chosen.values() for k in c.places}
-        used.update(*self._quality.values())
+        used = {c.place for c in self._chosen.values()} | set(self._quality.values())
         used |= taken if self.long is None else set()
         named = enumerate(matcher.names)
         self.ignored = tuple(name for k, name in named if k not in used and name)
@@ -255,8 +254,7 @@ class TableReader:
             places += [k for k in (long.tag, long.value, long.quality) if k >= 0]
             coded = long.quality >= 0 and understands(cells_of(self._file, long.quality))
         else:
-            places += [k for c in self._chosen.values() for k in c.places]
-            places += [k for several in self._quality.values() for k in several]
+            places += [c.place for c in self._chosen.values()] + list(self._quality.values())
         for frame in self._file.blocks(places):
             time_ns = self._read_times(frame)
             block = RawBlock(time_ns)
@@ -286,10 +284,9 @@ class TableReader:
                     f"{one if n == 1 else are} as missing; the first is '{text}' in row {row + 1}."
                 )
         for name, n in self._marked_bad.items():
-            places = self._quality[name] if self.long is None else (self.long.quality,)
-            columns = listed([f"'{self._file.names[k]}'" for k in places])
+            place = self._quality[name] if self.long is None else self.long.quality
             notes.append(
-                f"The quality of '{self.names[name]}' is read from {columns}, "
+                f"The quality of '{self.names[name]}' is read from '{self._file.names[place]}', "
                 f'by which {n} of its values {"is" if n == 1 else "are"} bad.'
             )
         if self.bad_times:
@@ -371,31 +368,27 @@ class TableReader:
         # If the user named columns of the table, it is a wide table.
         return None if any(theirs in names for theirs in by_signal.values()) else form
 
-    def _quality_places(self) -> dict[str, tuple[int, ...]]:
-        names = self._file.names
-        places: dict[str, tuple[int, ...]] = {}
-        used = {k for c in self._chosen.values() for k in c.places}
+    def _quality_places(self) -> dict[str, int]:
+        names, places = self._file.names, {}
+        used = {c.place for c in self._chosen.values()}
         for name, chosen in self._chosen.items():
             own = f'{name}{cell_values.QUALITY_SUFFIX}'
             if chosen.theirs == name and own in names:
-                places[name] = (names.index(own),)
+                places[name] = names.index(own)
                 continue
-            beside = (cell_values.quality_column(names[k], names) for k in chosen.places)
-            found = tuple(
-                k for k in beside
-                if k is not None and k not in used and understands(cells_of(self._file, k))
-            )  # fmt: skip
-            if found:
-                places[name] = found
+            place = cell_values.quality_column(chosen.theirs, names)
+            if place is None or place in used:
+                continue
+            if understands(cells_of(self._file, place)):
+                places[name] = place
         return places
 
     def _decided_marks(self) -> Marks:
         if self._file.marks is not None:
             return self._file.marks
+        places = {c.theirs: c.place for c in self._chosen.values()}
         if self.long is not None:
             places = {'value': self.long.value}
-        else:
-            places = {self._file.names[k]: k for c in self._chosen.values() for k in c.places}
         for theirs, place in places.items():
             cells = cells_of(self._file, place)
             if decimal_mark(cells, self._file.separator) is None:
@@ -440,14 +433,12 @@ class TableReader:
 
     def _read_wide(self, frame: pd.DataFrame, block: RawBlock) -> None:
         for name, chosen in self._chosen.items():
-            parts = [self._numbers(name, frame[k]) for k in chosen.places]
-            weighted = [w * part for w, part in zip(chosen.weights, parts, strict=True)]
-            block.columns[name] = sum(weighted[1:], weighted[0])
+            block.columns[name] = self._numbers(name, frame[chosen.place])
             if name in self._quality:
-                cells = [frame[k] for k in self._quality[name]]
+                cells = frame[self._quality[name]]
                 own = self.names[name] == name
                 block.quality[name] = (
-                    cell_values.to_quality(cells[0]) if own else self._foreign(name, *cells)
+                    cell_values.to_quality(cells) if own else self._foreign(name, cells)
                 )
 
     def _read_long(
@@ -464,9 +455,8 @@ class TableReader:
                 codes[mine] = self._foreign(name, frame[form.quality][mine])
                 block.quality[name] = codes
 
-    def _foreign(self, name: str, *cells: pd.Series[Any]) -> ByteArray:
-        # The worst of the columns of a sum.
-        codes: ByteArray = np.max([cell_values.foreign_quality(c) for c in cells], axis=0)
+    def _foreign(self, name: str, cells: pd.Series[Any]) -> ByteArray:
+        codes = cell_values.foreign_quality(cells)
         self._marked_bad[name] += int((codes == Quality.BAD).sum())
         return codes
 
