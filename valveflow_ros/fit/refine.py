@@ -21,6 +21,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.errors import TooFewSamplesError
+from valveflow_ros.fit.kernels import square_sum
 from valveflow_ros.fit.piece_selection import (
     choose_pieces,
     confidence,
@@ -242,9 +243,12 @@ _NARROWEST = 0.01  # of the range of u: narrower pieces are joined before the se
 # this time are free of that. They contain less about a plant whose fast movements fit as well, so
 # they must gain this log-likelihood. Of 20 plants with one lag none gained more than 4.
 _LONG_S, _LONG_GAIN = 600.0, 15.0
+_LONG_LEAST_S = 150.0  # in short or interrupted records; shorter means contain fast movements
 _LONG_LEAST_MW = 0.03  # the averaged rows are not more exact than this
-_LONG_EACH = 10  # at least so many means for each parameter,
-_LONG_SHARE = 0.75  # and with so much of the rows: gaps cost a mean each
+_LONG_EACH = 10  # at least so many innovations for each parameter,
+_LONG_SHARE = 0.75  # and with so much of the rows: gaps cost means
+# Values that a historian holds are wrong for minutes: long means would rest on these errors.
+_HELD_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,6 +332,7 @@ def refine(
     Refined
     """
     model, likely, moved, fitted = _outlined(samples, start, most_pieces, exponent, usual)
+    limits = (0.0, 0.0) if exponent is None else _changes_allowed(exponent)
     samples = samples.with_exponent(moved)
     problem = Problem(samples)
     searched = model.pieces
@@ -350,8 +355,8 @@ def refine(
     model = corrected(samples, fine, model, ar, free)
     long = _long_means(samples, fine, model, free)
     if long is not None:
-        start_exponent = exponent + moved if fitted and exponent is not None else None
-        model, by, long = _fitted_to(long, model, free, start_exponent)
+        left = None if not fitted else (limits[0] - moved, limits[1] - moved)
+        model, by, long = _fitted_to(long, model, free, left)
         if by:
             moved, samples = moved + by, samples.with_exponent(by)
             problem, fine = Problem(samples), Problem(samples.finer())
@@ -366,14 +371,17 @@ def _long_means(
 ) -> Samples | None:
     """Return the rows as long means, if there are enough and another curve fits them better."""
     rows = int(fine.answer(model)[1].sum()) * fine.samples.group * fine.samples.step_s
+    same = (np.diff(samples.u) == 0.0) & (np.diff(samples.scale_or_ones) == 0.0)
+    if np.mean(same[samples.usable[1:] > 0]) > _HELD_SHARE:
+        return None
     length = _LONG_S
-    while length > 2.0 * samples.step_s:
+    while length >= max(_LONG_LEAST_S, 2.0 * samples.step_s):
         long = samples.slower(length)
         problem = Problem(long)
         before, weight = problem.answer(model)
-        means = int(weight.sum())
+        ar = fit_ar(before, weight)
+        means = int(square_sum(before, weight, ar)[1])
         if means >= _LONG_EACH * free.sum() and means * length >= _LONG_SHARE * rows:
-            ar = fit_ar(before, weight)
             trial, _ = move(problem, model, ar, _of_curve(model, free), 3)
             change = (problem.answer(trial)[0] - before)[weight > 0]
             other = np.sqrt(np.mean(change**2)) > _LONG_LEAST_MW * problem.size
@@ -383,12 +391,12 @@ def _long_means(
 
 
 def _fitted_to(
-    long: Samples, model: RegionalModel, free: BoolArray, exponent: float | None
+    long: Samples, model: RegionalModel, free: BoolArray, limits: tuple[float, float] | None
 ) -> tuple[RegionalModel, float, Samples]:
-    """Fit the curve, and the exponent if it is free, to long means; return also its change."""
+    """Fit the curve to long means, and the exponent within ``limits``; return also its change."""
     curve, by = _of_curve(model, free), 0.0
-    if exponent is not None:
-        found = _with_exponent(long, model, exponent, False, curve)
+    if limits is not None:
+        found = _with_exponent(long, model, limits, False, curve)
         assert found is not None
         model, by = found
         long = long.with_exponent(by)
@@ -445,7 +453,9 @@ def _outlined(
     model, likely = _search(Problem(coarse), _join(start), most_pieces)
     if exponent is None or samples.pressure_mpa is None:
         return model, likely, 0.0, False
-    found = _with_exponent(coarse, model, exponent, exponent == usual, free_parameters(model))
+    found = _with_exponent(
+        coarse, model, _changes_allowed(exponent), exponent == usual, free_parameters(model)
+    )
     if found is None:
         return model, likely, 0.0, False
     model, moved = found
@@ -457,14 +467,13 @@ def _outlined(
 
 
 def _with_exponent(
-    rows: Samples, model: RegionalModel, exponent: float, kept: bool, free: BoolArray
+    rows: Samples, model: RegionalModel, limits: tuple[float, float], kept: bool, free: BoolArray
 ) -> tuple[RegionalModel, float] | None:
-    """Return a model with the exponent that fits best, and the change of the exponent.
+    """Return a model with the exponent that fits best, and the change of it within ``limits``.
 
     None if the exponent is to be ``kept`` unless another one is clearly better, and none is.
     """
     by, error = 0.0, math.nan
-    low, high = (limit - exponent for limit in exponents_near(exponent))
     for _ in range(_EXPONENT_ROUNDS):
         problem = Problem(rows.with_exponent(by))
         ar = fit_ar(*problem.answer(model))
@@ -474,7 +483,7 @@ def _with_exponent(
             break
         if kept and not by and abs(step[-1]) < _EXPONENT_FIRST_Z * error:
             return None
-        trial = float(np.clip(by + np.clip(step[-1], -_EXPONENT_MOST, _EXPONENT_MOST), low, high))
+        trial = float(np.clip(by + np.clip(step[-1], -_EXPONENT_MOST, _EXPONENT_MOST), *limits))
         # Exponent, curve and c are nearly interchangeable: damped steps would move them apart.
         share = (trial - by) / step[-1]
         change = share * step[: model.size]
@@ -484,6 +493,12 @@ def _with_exponent(
         model, _ = move(Problem(rows.with_exponent(trial)), model, ar, free, 3)
         by = trial
     return None if kept and not abs(by) > _EXPONENT_Z * error else (model, by)
+
+
+def _changes_allowed(exponent: float) -> tuple[float, float]:
+    """Return the lowest and highest change of an exponent from its start."""
+    low, high = exponents_near(exponent)
+    return low - exponent, high - exponent
 
 
 def least_rows(step_s: float) -> int:

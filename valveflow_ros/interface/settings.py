@@ -83,6 +83,9 @@ def _window_days(span_s: float, period: float, longest_s: float) -> float:
     return max(least, math.ceil(100.0 * (span_s / 86400.0 + 0.01)) / 100.0)
 
 
+_EXPONENT = 'pressure_exponent'
+
+
 def read_parameters(
     file: Path | None, pairs: Sequence[str], *, of_node: bool = False
 ) -> dict[str, Any]:
@@ -92,6 +95,9 @@ def read_parameters(
     `RecordingError` or `InputError` for the file, `UsageError` for ``--set``.
     """
     given: dict[str, Any] = {} if file is None else _from_file(file, of_node)
+    # A file may list every parameter: only --set makes the usual exponent one to be checked.
+    if given.get(_EXPONENT) == parameter(_EXPONENT).default:
+        del given[_EXPONENT]
     for text in pairs:
         name, equals, value = text.partition('=')
         if not equals or not name.strip():

@@ -328,7 +328,7 @@ class TableReader:
             return date, None
         # Raises if two columns have this name.
         matcher.find(self._file.names[time])
-        if self._options.period and not named and not self._holds_times(time, date):
+        if self._options.period and not self._holds_times(time, date):
             return None, None
         # A separate date is used only if the time column holds times of day.
         cells = cells_of(self._file, time)
