@@ -47,6 +47,13 @@ _SMALL = 'diagnosis_hidden_30000_30002_5d'
 _KIND_WORDS = {
     'choked': 'choked', 'sequence': 'valves in sequence', 'integrated_input': "the paper's form",
 }  # fmt: skip
+
+
+def _kind_words(kind: str) -> str:
+    sliding = kind.removesuffix('_fixed')
+    return _KIND_WORDS[sliding] + (' at fixed pressure' if sliding != kind else '')
+
+
 _RECORDINGS = {
     'minute_901_930': 'means over a minute', '1s_901_910': 'every second',
     'compressed_901_910': 'exceptions alone',
@@ -173,9 +180,9 @@ def _diagnosis() -> list[Row]:
     r = result(_SMALL)
     silent = sum(not row['names'] for row in r['rows'])
     beside = r['records'] - r['right'] - silent
-    names = 'thermal_names_minute_801_825'
+    names = 'thermal_names_minute_951_960'
     counts = ', '.join(
-        f'{_KIND_WORDS[kind]} {s["named"]} of {s["units"]} named'
+        f'{_kind_words(kind)} {s["named"]} of {s["units"]} named'
         for kind, s in result(names)['summary'].items()
     )
     return [

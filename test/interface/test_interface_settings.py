@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,11 +106,21 @@ def test_wrong_parameters_are_refused(tmp_path, text, pair, error, parts):
 def test_set_stands_above_the_file_which_may_hold_plain_names(tmp_path):
     file = tmp_path / 'p.yaml'
     file.write_text(as_yaml(values={**Settings(), 'time_constant': 33.0, 'unit_tag': 'B2'}))
-    found = read_parameters(file, ['time_constant=44', 'record=no', 'max_pieces=7'])
+    found = read_parameters(
+        file, ['time_constant=44', 'record=no', 'max_pieces=7', 'pressure_exponent=1.125']
+    )
     assert found == {**Settings(), 'unit_tag': 'B2', 'time_constant': 44.0, 'record': False,
                      'max_pieces': 7}  # fmt: skip
     file.write_text('time_constant: 33\n')
     assert read_parameters(file, []) == {'time_constant': 33.0}
+
+
+def test_a_file_with_every_default_does_not_ask_to_check_the_exponent():
+    file = Path(__file__).parents[2] / 'config' / 'monitor.yaml'
+    listed = read_parameters(file, [])
+    assert 'time_constant' in listed
+    assert 'pressure_exponent' not in listed
+    assert read_parameters(file, ['pressure_exponent=1.125'])['pressure_exponent'] == 1.125
 
 
 STEPS = st.dictionaries(st.sampled_from(Signal), st.floats(1e-3, 1e5), max_size=5)
