@@ -163,6 +163,10 @@ def from_refined(
     )
 
 
+# How the notes on a fitted exponent begin.
+EXPONENT_NOTES = 'The exponent m of the pressure was fitted:', 'This is an end of the range'
+
+
 def _form_errors(
     static: Characteristic, result: Refined, within: tuple[float, float]
 ) -> tuple[str, ...]:
@@ -173,7 +177,7 @@ def _form_errors(
     if math.isnan(result.exponent_stderr):
         return ()
     m = static.static_form.exponent + (result.exponent_moved if static.axis == OPENING else 0.0)
-    said = f'The exponent m of the pressure was fitted: {m:.3f}'
+    said = f'{EXPONENT_NOTES[0]} {m:.3f}'
     at_end = min(abs(m - limit) for limit in within) < _AT_END
     if not at_end:
         said += f' ± {_Z95 * result.exponent_stderr:.3f}'
@@ -184,7 +188,7 @@ def _form_errors(
         return (f'{said}.',)
     return (
         f'{said}.',
-        f'This is an end of the range {within[0]:.3g} to {within[1]:.3g} in which m is searched, '
+        f'{EXPONENT_NOTES[1]} {within[0]:.3g} to {within[1]:.3g} in which m is searched, '
         'and the data ask for one beyond it: check the zero and the range of the pressure '
         'transmitter, and whether the curve fits over opening and pressure.',
     )

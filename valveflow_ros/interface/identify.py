@@ -21,6 +21,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import DataError, UsageError, listed
 from valveflow_ros.fit.model_form import find_misfit
+from valveflow_ros.fit.result import EXPONENT_NOTES
 from valveflow_ros.fit.static_test import find_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
@@ -207,7 +208,7 @@ def _identified(
         form = None if reference is None else reference.static_form
         form = form if model is None else model.form
         observed = replace(observed, task=replace(observed.task, form=form))
-        characteristic = _without_hidden_times(observed.fit(progress), log)
+        characteristic = _of_compressed(observed.fit(progress), log)
     except DataError as error:
         table, _, counts = align_whole(log.readings, settings)
         read = _rows_as_read(log.readings)
@@ -248,22 +249,32 @@ def _identified(
     return replace(found, misfit=misfit)
 
 
-def _without_hidden_times(c: Characteristic, log: Log) -> Characteristic:
-    """Return the curve with times as uncertain as the power of a compressed log is far apart."""
-    power = log.compression and log.compression.updates.get(Signal.GENERATED_POWER)
-    if not power:
-        return c
-    dynamics = tuple(
-        replace(
-            region,
-            time_constant_stderr_s=max(region.time_constant_stderr_s, power.interval_s),
-            delay_stderr_s=max(region.delay_stderr_s, power.interval_s),
+def _of_compressed(c: Characteristic, log: Log) -> Characteristic:
+    """Return the curve without what the updates of a compressed log hide: short times and m."""
+    updates = {} if log.compression is None else log.compression.updates
+    if power := updates.get(Signal.GENERATED_POWER):
+        dynamics = tuple(
+            replace(
+                region,
+                time_constant_stderr_s=max(region.time_constant_stderr_s, power.interval_s),
+                delay_stderr_s=max(region.delay_stderr_s, power.interval_s),
+            )
+            if region.time_constant_s < power.interval_s
+            else region
+            for region in c.dynamics
         )
-        if region.time_constant_s < power.interval_s
-        else region
-        for region in c.dynamics
+        c = replace(c, dynamics=dynamics)
+    pressure = updates.get(Signal.MAIN_STEAM_PRESSURE)
+    if pressure is None or not (said := [n for n in c.notes if n.startswith(EXPONENT_NOTES)]):
+        return c
+    # Errors of the pressure make its effect, and so m, too small: by 0.05 to 0.1 on such units.
+    hidden = (
+        'The exponent m of the pressure and the power without flow cannot be judged in this log: '
+        f'the historian keeps a pressure until it has changed by {pressure.dead_band:.2g} MPa, '
+        f'and such errors make m too small. The curve was found with m = '
+        f'{c.static_form.exponent:.3f}.'
     )
-    return replace(c, dynamics=dynamics)
+    return replace(c, notes=(*(n for n in c.notes if n not in said), hidden))
 
 
 def _inputs(table: SampleTable) -> tuple[FloatArray, FloatArray]:
