@@ -328,7 +328,7 @@ def results() -> str:
         ('units built from physics, with an effect or healthy: [a benchmark](docs/naming.md)',
          f'right answers in {_total(named, "right")} of {_total(named, "records")}, a wrong or '
          f'further name in {_total(named, "wrong")}'),
-        ('sticking valves of a refinery, from command and process value (real data)',
+        ('valves of a refinery, each by all its records of command and process value (real data)',
          f'{valves["found"] * valves["sticky"]:.0f} of {valves["sticky"]} found, '
          f'{valves["falsely_named"] * valves["sound"]:.0f} of {valves["sound"]} sound ones '
          f'named, {valves["open"]} not judged; on simulated loops '

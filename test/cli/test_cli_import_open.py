@@ -210,7 +210,10 @@ def test_a_table_without_times_has_a_period(run, tmp_path, frame, said):
     path, log = tmp_path / 'a.csv', tmp_path / 'x.mcap'
     frame.to_csv(path, index=False)
     ran = run('import', path, '-o', log, '--period', said).done()
-    assert 'The table has no times; its rows were taken to be 60 s apart' in ran.out + ran.err
+    assert (
+        'The table has no times; its rows were taken to be 60 s apart, oldest first'
+        in ran.out + ran.err
+    )
     pressure = frame['main_steam_pressure_mpa'].to_numpy()
     assert np.array_equal(values(log, Signal.MAIN_STEAM_PRESSURE), pressure)
     assert vf.open_log(path, period=said).span_s == 60.0 * (len(ROWS) - 1)

@@ -349,8 +349,8 @@ class RowClock:
     def finish(self) -> list[str]:
         """Return notes about the times."""
         return [
-            f'The table has no times; its rows were taken to be {self._period} apart, from '
-            '2000-01-01 on.'
+            f'The table has no times; its rows were taken to be {self._period} apart, '
+            'oldest first, from 2000-01-01 on.'
         ]
 
     @property
