@@ -92,8 +92,8 @@ torture: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) for recording in '1s --seeds 30' 'compressed --seeds 30' 'minute --seeds 30'; do \
-	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input --first 701 \
+	@$(ENV) for recording in '1s --seeds 10' 'compressed --seeds 10' 'minute --seeds 30'; do \
+	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input --first 901 \
 	  --recording $$recording || exit 1; done
 
 study-diagnosis: setup

@@ -22,9 +22,11 @@ from valveflow_ros.records import BoolArray, FloatArray, IntArray
 from valveflow_ros.signals.static_form import (
     EXPONENTS,
     INTEGRATED_INPUT,
+    LEAST_PRESSURE_RANGE,
     OPENING,
     StaticForm,
     exponents_near,
+    pressure_range,
 )
 
 _MEAN_S = 60.0
@@ -47,8 +49,6 @@ _EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
 # If undecided, the form over V is used if its gain exceeds this many standard errors.
 _LIKELIER_Z = 1.5
 _CHOKED_EXPONENT = 1.0
-# Below this range of the pressure, as fraction of its median, an exponent is mostly noise.
-_LEAST_RANGE = 0.1
 _WORST = 0.05
 _LEAST_IN_CELL, _EIGHTHS = 5, 8
 _MISFIT = 0.01  # of the power's range
@@ -153,8 +153,7 @@ def find_form(
     choked = known.exponent if known is not None and known.scaled else ideal
     usual = known if known is not None and not known.scaled else None
     paper = _with_exponent(means, usual or StaticForm(INTEGRATED_INPUT, exponent))
-    low, middle, high = np.quantile(means.pressure, (0.02, 0.5, 0.98))
-    moves = bool(high - low > _LEAST_RANGE * middle)
+    moves = pressure_range(means.pressure) >= LEAST_PRESSURE_RANGE
     scaled = (
         _best(means, OPENING, within) if moves else _fitted(means, StaticForm(OPENING, choked))
     )

@@ -19,7 +19,7 @@ from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Section
 from valveflow_ros.report.words import Z95
-from valveflow_ros.signals.static_form import OPENING
+from valveflow_ros.signals.static_form import LEAST_PRESSURE_RANGE, OPENING, pressure_range
 
 _SHADES = 5
 _COLUMNS, _ROWS = 150, 100
@@ -29,7 +29,6 @@ _LEAST = 3  # fewer segments are not drawn
 _SURE = 0.9999
 _SAME_PRESSURE = 0.02
 _OPENINGS = 121
-_PRESSURE_MOVES = 0.1  # of its median, below which there is no figure over it
 _CONTOURS = 10
 
 
@@ -136,8 +135,7 @@ def surface_figure(data: Identified) -> Figure | None:
     opening, pressure, residual = opening[known], pressure[known], found.residual_mw[known]
     if len(residual) < _LEAST:
         return None
-    low, middle, high = np.quantile(pressure, (0.02, 0.5, 0.98))
-    if high - low < _PRESSURE_MOVES * middle:
+    if pressure_range(pressure) < LEAST_PRESSURE_RANGE:
         return None
     p = np.linspace(float(pressure.min()), float(pressure.max()), _OPENINGS)
     widest = float(opening.min()), float(opening.max())
@@ -187,7 +185,7 @@ def surface_figure(data: Identified) -> Figure | None:
 
 
 def _round_levels(power: FloatArray) -> list[float]:
-    """Return about eight round numbers in the range of a power."""
+    """Return at most about ten round numbers in the range of a power."""
     low, high = float(np.nanmin(power)), float(np.nanmax(power))
     step = 10.0 ** math.floor(math.log10(max(high - low, 1e-6) / _CONTOURS))
     step *= next(k for k in (1.0, 2.0, 5.0, 10.0) if (high - low) / (k * step) <= _CONTOURS)

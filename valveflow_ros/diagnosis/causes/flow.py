@@ -14,6 +14,7 @@ from valveflow_ros.diagnosis.cause import Cause, Stage, Start, Unknown, Values
 from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.records import FloatArray
+from valveflow_ros.signals.static_form import LEAST_PRESSURE_RANGE, pressure_range
 
 
 def apply_exponent(
@@ -49,19 +50,11 @@ def exponent_sentence(values: dict[str, float]) -> str:
 
 
 def hindered(grids: Grids) -> str:
-    """Return that the pressure does not change enough; empty if it does.
-
-    Below this range of the pressure, as in `fit.model_form`, weather and the curve's own misfit
-    decide the exponent: on units at fixed pressure intervals of 0.007 were 0.03 off.
-    """
-    low, middle, high = np.quantile(grids.pressure[grids.usable > 0], (0.02, 0.5, 0.98))
-    moves = float(high - low) / max(float(middle), 1e-9)
-    if moves >= _LEAST_RANGE:
+    """Return that the pressure does not change enough; empty if it does."""
+    moves = pressure_range(grids.pressure[grids.usable > 0])
+    if moves >= LEAST_PRESSURE_RANGE:
         return ''
     return f'the main steam pressure moves by {100.0 * moves:.2g} % only'
-
-
-_LEAST_RANGE = 0.1
 
 
 EXPONENT = Cause(
