@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from streams import lagged, needs_jit, steps_and_ramps
 
 from valveflow_ros.curve.regional_model import RegionalModel
@@ -269,3 +270,55 @@ def test_sensor_noise_makes_the_plant_slower_and_most_of_it_is_taken_back(monkey
             errors[name].append(result.model.time_constants[0] - 8.0)
     assert np.mean(errors['as it is']) > 0.1
     assert abs(np.mean(errors['corrected'])) < 0.5 * np.mean(errors['as it is'])
+
+
+def stored(x, band, most=300):
+    """Return the rows that a historian holds: a new value after a change by the dead band."""
+    out, age = x.copy(), 0
+    for k in range(1, len(x)):
+        age += 1
+        if abs(x[k] - out[k - 1]) < band and age < most:
+            out[k] = out[k - 1]
+        else:
+            age = 0
+    return out
+
+
+def held(seed, n=20000):
+    """Return rows of P = p F(V) held by a historian, and the model."""
+    rng = np.random.default_rng(seed)
+
+    def wander(sd, rows):
+        phi = np.exp(-1.0 / rows)
+        return lfilter([sd * np.sqrt(1.0 - phi**2)], [1.0, -phi], rng.normal(size=n))
+
+    v = np.clip(65.0 + wander(8.0, 2000.0) + wander(1.0, 60.0), 42.0, 88.0)
+    p = 15.0 + wander(1.5, 3000.0) + wander(0.05, 100.0) - 0.02 * (v - 65.0)
+    true = replace(
+        straight([40.0, 60.0, 90.0], [6.0, 12.0, 15.0]), offset_mw=0.0,
+        time_constants=np.array([10.0]), delays=np.array([2.0]),
+    )  # fmt: skip
+    usable = np.ones(n, dtype=np.uint8)
+    y = true.respond(v, usable, 2.0, 0.0, p)[0] + wander(0.5, 200.0)
+    v, p = v + 0.05 * rng.normal(size=n), p + 0.01 * rng.normal(size=n)
+    v, p, y = stored(v, 0.5), stored(p, 0.12), stored(y, 2.0)
+    return Samples(v, y, usable, 2.0, 110.0, 5, scale=p, pressure_mpa=p), true
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_what_a_historian_held_hardly_makes_the_plant_slower(seed):
+    rows, true = held(seed)
+    assert rows.held
+    assert not measured(TRUE, 0).held
+    start = replace(true, time_constants=np.empty(0), delays=np.empty(0))
+    model = refine(rows, start).model
+    assert model.time_constants == pytest.approx(10.0, rel=0.5)  # without the correction 16 to 23
+
+
+def test_simulated_rows_are_those_of_a_historian():
+    rows, true = held(1, 4000)
+    again = rows.simulated(true)
+    new = np.append(True, np.diff(rows.power_mw) != 0.0)
+    assert np.all(np.diff(again.power_mw)[~new[1:]] == 0.0)  # stored at the same times
+    assert np.abs(again.power_mw - rows.power_mw).mean() < 1.5
+    assert again.power_mw.std() == pytest.approx(rows.power_mw.std(), rel=0.02)

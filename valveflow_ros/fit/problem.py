@@ -15,7 +15,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.descent import descend, gauss_newton
 from valveflow_ros.fit.kernels import answer_residual, normal_sums, square_sum, tangents
 from valveflow_ros.numerics import cores, output_size, run_in_threads, runs
-from valveflow_ros.records import BoolArray, ByteArray, FloatArray
+from valveflow_ros.records import BoolArray, ByteArray, FloatArray, IntArray
 
 # The last fit averages few rows: a load controller that reacts to the power within the averaged
 # rows would otherwise be taken for dynamics of the valve.
@@ -27,6 +27,9 @@ _FORGOTTEN = 40.0
 # depends on rows and model only, so that the result does not depend on the machine.
 _STRETCH = 8192
 _FEW = 4
+# Rows are taken as held by a historian if more than this part of them repeats the row before.
+# A measured power hardly ever repeats by chance.
+_HELD_SHARE = 0.3
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
@@ -68,6 +71,40 @@ class Samples:
     def scale_or_ones(self) -> FloatArray:
         """Return p^e, or ones for a form without p^e."""
         return np.ones(len(self.u)) if self.scale is None else self.scale
+
+    @property
+    def held(self) -> bool:
+        """Return True if many rows repeat the row before: a historian held its values."""
+        signals = self.u, self.scale_or_ones, self.power_mw
+        same = np.all([np.diff(x) == 0.0 for x in signals], axis=0)
+        return float(np.mean(same[self.usable[1:] > 0])) > _HELD_SHARE
+
+    def simulated(self, model: RegionalModel) -> Samples:
+        """Return held rows with the power that would have been stored if the model were true.
+
+        Between two stored values the true input is taken as a straight line, up to a typical
+        change: so it differs from the held rows about as the input of the plant does.
+        """
+        usable = self.usable > 0
+        begin = usable & ~np.append(False, usable[:-1])
+        rows = np.arange(len(usable))
+
+        def stored(values: FloatArray) -> tuple[IntArray, IntArray]:
+            new = np.append(True, values[1:] != values[:-1])
+            at = np.flatnonzero(usable & (begin | new))
+            return at, at[np.maximum(np.searchsorted(at, rows, side='right') - 1, 0)]
+
+        def between(values: FloatArray) -> FloatArray:
+            at, last = stored(values)
+            change = np.abs(np.diff(values[at]))
+            typical = float(np.median(change)) if len(change) else 0.0
+            ahead = np.interp(rows, at, values[at]) - values[last]
+            return np.asarray(values[last] + np.clip(ahead, -typical, typical))
+
+        power, _ = model.respond(
+            between(self.u), self.usable, self.step_s, self.settle_s, between(self.scale_or_ones)
+        )
+        return replace(self, power_mw=power[stored(self.power_mw)[1]])
 
     def with_exponent(self, by: float) -> Samples:
         """Return the rows with an exponent of the pressure that is larger by ``by``."""
