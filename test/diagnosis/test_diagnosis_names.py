@@ -21,6 +21,7 @@ from diagnosis_records import (
 )
 from streams import needs_jit
 
+import valveflow_ros as vf
 from valveflow_ros.diagnosis.diagnose import diagnose
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.unit import Noise, Programme
@@ -192,6 +193,20 @@ def rough_model_of_the_unit():
         rough_model(), levels=np.array([240.0]), time_constants=np.array([10.0, 80.0]),
         delays=np.array([3.0, 10.0]),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('unit', 'days', 'effects'), [
+        ('integrated_input_fixed:number=1312', 8.0, []),  # a rounded breakpoint
+        ('sequence_fixed:number=82036', 5.0, ['input_step:g=0.0068984,t0_days=3.51947']),
+    ],
+)  # fmt: skip
+def test_the_shape_of_a_healthy_valve_is_no_bump(unit, days, effects):
+    number = int(unit.partition('=')[2])
+    plant = vf.simulate(days, number, effects, unit=unit, recording='minute')
+    covariates = {'vacuum': 'condenser_pressure_kpa'} if effects else {}
+    found = vf.diagnose(plant.to_dataframe(), covariates=covariates).diagnosis
+    assert 'curve_shape' not in names(found)
 
 
 def test_faults_of_the_record_are_named_and_masked():

@@ -253,6 +253,7 @@ NOT_TOLD_APART = 10.0
 # Of the largest power. The breakpoints of real valves are rounded; fixed on units built from
 # physics with numbers 5001 to 5012.
 _LEAST_HEIGHT = 0.0025
+_AT_KNOT = 0.5  # of the half width: a bend nearer to a breakpoint rounds it
 KEPT_LEAST = 8.0
 STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
 _SHORT_STEPS_MW = (1.0, 0.4)
@@ -289,6 +290,8 @@ class SearchResult:
         The record with longer model rows, for screening.
     other_bend : Extended, optional
         The model with the opposite sign, if `curve_shape` may be a bump or a dent.
+    with_knots : Extended, optional
+        The plain model before breakpoints that a bump could replace were removed.
     """
 
     task: Task
@@ -300,6 +303,7 @@ class SearchResult:
     tried: int = 0
     rough: Grids | None = None
     other_bend: Extended | None = None
+    with_knots: Extended | None = None
 
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'
@@ -310,9 +314,10 @@ def search(
 ) -> SearchResult:
     """Fit the plain model, then add causes while one of them passes all tests."""
     progress(0.05, 'simulation fitted to the record')
-    task, plain, _ = settle(task, start, rounds=2, steps=4)
-    task, plain = without_bumps(task, plain)
-    found = SearchResult(task, plain, plain, rough=rough)
+    task, rich, _ = settle(task, start, rounds=2, steps=4)
+    task, plain = without_bumps(task, rich)
+    with_knots = None if plain is rich else rich
+    found = SearchResult(task, plain, plain, rough=rough, with_knots=with_knots)
     barred: set[str] = set()
     every = causes_for(task.grids)
     for name, cause in every.items():
@@ -368,6 +373,10 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
             # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
             continue
+        if rival.added.name == 'curve_shape' and _as_knots(found, rival):
+            found.reasons['curve_shape'] = 'breakpoints of the curve explain the data better'
+            barred.add('curve_shape')
+            return True
         best = rival.score if best is None else best
         without = found.model
         evidence = weigh(found.task, without, rival.model, rival.added.size)
@@ -416,10 +425,33 @@ def _rounded(task: Task, rival: Rival) -> str:
     """Return why a bend is none: the straight pieces of a healthy valve miss as much; or ''."""
     if rival.added.name != 'curve_shape':
         return ''
-    height, least = abs(rival.added.values[0]), _LEAST_HEIGHT * float(np.max(task.grids.power))
-    if height > least:
-        return ''
-    return f'a healthy valve differs from straight pieces by up to {least:.2g} MW, this by less'
+    height, centre, width = rival.added.values
+    least = _LEAST_HEIGHT * float(np.max(task.grids.power))
+    if abs(height) <= least:
+        return (
+            f'a healthy valve differs from straight pieces by up to {least:.2g} MW, this by less'
+        )
+    base = rival.model.base
+    turns = np.diff(base.slopes())[np.abs(base.knots[1:-1] - centre) < _AT_KNOT * width]
+    if np.any(turns * height > 0.0):
+        return 'it lies at a breakpoint, as the rounded breakpoint of a healthy valve would'
+    return ''
+
+
+def _as_knots(found: SearchResult, rival: Rival) -> bool:
+    """Put back the breakpoints in place of a bump if they explain the data better."""
+    if found.with_knots is None:
+        return False
+    model, _ = improve(found.task, replace(found.model, base=found.with_knots.base), 4)
+    task, bump = found.task, rival.model
+    variance = task.cost(model) / float(task.rows.sum())
+    gain = 0.5 * (task.cost(bump) - task.cost(model)) / variance
+    more = model.base.size - bump.base.size - rival.added.size
+    if gain <= PENALTY * more:
+        return False
+    found.task, found.model, _ = settle(task, model, rounds=1, steps=3)
+    found.plain = found.with_knots
+    return True
 
 
 def _visible(found: SearchResult, rivals: list[Rival], barred: set[str]) -> list[Rival]:
