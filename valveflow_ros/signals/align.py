@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valveflow_ros import state
-from valveflow_ros.numerics import inlined, jit
+from valveflow_ros.numerics import copied, helper, inlined, jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     N_SIGNALS,
@@ -177,7 +177,7 @@ def _close(state: State, rules: Rules, rows: AlignedRows, place: int, coming_ns:
     return False
 
 
-@jit
+@helper
 def _drop_waiting(state: State) -> None:
     """Drop and count the waiting readings that were not confirmed."""
     for k in range(state.clock[_WAITING]):
@@ -185,7 +185,7 @@ def _drop_waiting(state: State) -> None:
     state.clock[_WAITING] = 0
 
 
-@jit
+@copied
 def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> int:
     """Add a reading far off in time to the waiting ones; 1 confirms a jump ahead, -1 one back."""
     clock = state.clock
@@ -208,7 +208,7 @@ def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) ->
     return 1 if ahead else -1
 
 
-@jit
+@copied
 def _forget(state: State) -> None:
     """Reset after a step back of the clock; the waiting readings are confirmed."""
     state.clock[_RESETS] += 1
@@ -219,7 +219,7 @@ def _forget(state: State) -> None:
     state.open_row[:] = NEVER
 
 
-@jit
+@helper
 def _close_ready(
     state: State, rules: Rules, rows: AlignedRows, written: int, coming_ns: int, rest: bool
 ) -> int:
@@ -242,7 +242,7 @@ def _close_ready(
     return written
 
 
-@inlined
+@copied
 def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
     """Return why a reading is rejected, or `_ACCEPTED`."""
     if not 0 <= t < _LATEST_NS:
