@@ -81,9 +81,9 @@ def test_no_thread_is_started_for_which_there_is_no_task():
 # --- compiled code ---------------------------------------------------------------------------
 
 INNER = """
-from valveflow_ros.numerics import inlined
+from valveflow_ros.numerics import {how}
 
-@inlined
+@{how}
 def step(x):
     return x + {step}
 """
@@ -119,14 +119,15 @@ def run(folder: Path) -> list[str]:
 
 
 @needs_jit
-def test_what_was_compiled_is_used_again_while_nothing_that_it_is_made_of_has_changed(tmp_path):
+@pytest.mark.parametrize('how', ['inlined', 'helper', 'copied'])
+def test_what_was_compiled_is_used_until_something_that_it_is_made_of_changes(tmp_path, how):
     inner, outer = tmp_path / 'inner.py', tmp_path / 'outer.py'
-    write(inner, INNER.format(step=1.0), 1e9)
+    write(inner, INNER.format(how=how, step=1.0), 1e9)
     write(outer, OUTER.format(name='State'), 1e9)
     assert run(tmp_path) == ['2.0', '0']
     os.utime(inner, (4e9, 4e9))
     assert run(tmp_path) == ['2.0', '1'], 'it is kept, although a file is from the future'
-    inner.write_text(INNER.format(step=5.0))
+    inner.write_text(INNER.format(how=how, step=5.0))
     assert run(tmp_path) == ['6.0', '0'], 'a file that is called has changed'
     write(outer, OUTER.format(name='Renamed'), 2e9)
     assert run(tmp_path)[0] == '6.0', 'a type of another name is no error'

@@ -116,20 +116,30 @@ def kernel(function: _Function) -> _Function:
 
 
 # Not callable from Python: this saves the time to compile wrappers.
-_INLINED_JIT: dict[str, Any] = {
-    **_KERNEL_JIT,
-    'forceinline': True,
-    'no_cpython_wrapper': True,
-}
+_HELPER_JIT: dict[str, Any] = {**_KERNEL_JIT, 'no_cpython_wrapper': True}
+
+
+def helper(function: _Function) -> _Function:
+    """Compile a loop that only compiled ones call, in several places."""
+    return cast(_Function, _prepared(numba.njit(**_HELPER_JIT)(function)))
 
 
 def inlined(function: _Function) -> _Function:
-    """Compile a part of a `kernel` into its caller.
+    """Compile a part of a `kernel` into its callers.
 
     A call with tuples of arrays takes longer than a short loop: every array is passed
     as seven numbers, and its reference count is increased and decreased.
     """
-    return cast(_Function, _prepared(numba.njit(**_INLINED_JIT)(function)))
+    return cast(_Function, _prepared(numba.njit(forceinline=True, **_HELPER_JIT)(function)))
+
+
+def copied(function: _Function) -> _Function:
+    """Copy a part of a loop into the one place that calls it, before that is compiled.
+
+    A compiled function is optimised and translated alone, and again with each of its callers
+    and of theirs. The copy has its caller's rule for a division by zero.
+    """
+    return cast(_Function, numba.njit(inline='always')(function))
 
 
 # Python threads for kernels that release the interpreter lock.

@@ -21,7 +21,7 @@ from valveflow_ros.curve.regional_model import (
     TAP_WHOLE,
     make_taps,
 )
-from valveflow_ros.numerics import inlined, kernel
+from valveflow_ros.numerics import copied, helper, inlined, kernel
 from valveflow_ros.records import ByteArray, FloatArray
 
 # Residuals of curve and regional dynamics over all rows, a block at a time.
@@ -35,7 +35,7 @@ _BLOCK = 256
 NONE = np.uint8(255)
 
 
-@inlined
+@copied
 def flow_of(u: FloatArray, knots: FloatArray, left: FloatArray, right: FloatArray,
             flow: FloatArray) -> None:  # fmt: skip
     """Write F(u) to ``flow``, both (n,); the outer pieces extend to infinity."""
@@ -70,7 +70,7 @@ def region_of_each(
         region[i] = region[i] if usable[i] else NONE
 
 
-@inlined
+@copied
 def _delayed(flow: FloatArray, first: int, count: int, tap: FloatArray, fed: FloatArray) -> None:
     """Write the input to ``count`` rows from ``first`` on from the delayed flows."""
     at = first - int(tap[TAP_WHOLE])
@@ -80,7 +80,7 @@ def _delayed(flow: FloatArray, first: int, count: int, tap: FloatArray, fed: Flo
         fed[i] = a * x[i] + b * y[i] + c * z[i]
 
 
-@inlined
+@copied
 def _feed(
     flow: FloatArray, t: int, region: ByteArray, taps: FloatArray, settle: int, age: int,
     fed: FloatArray, decay: FloatArray, settled: ByteArray,
@@ -383,7 +383,7 @@ def tangents(
 _NORMAL_BLOCK = 128
 
 
-@inlined
+@helper
 def _innovations(
     rows: FloatArray, first: int, count: int, width: int, ar: FloatArray, out: FloatArray
 ) -> None:
@@ -443,7 +443,7 @@ def square_sum(residual: FloatArray, weight: ByteArray, ar: FloatArray) -> tuple
     return (sums[0] + sums[1]) + (sums[2] + sums[3]), rows
 
 
-@inlined
+@copied
 def _add_products(table: FloatArray, rows: int, sums: FloatArray) -> None:
     """Add the products of all columns of ``table``; ``rows`` must be a multiple of four."""
     columns = table.shape[1]

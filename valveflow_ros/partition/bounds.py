@@ -42,7 +42,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.numerics import inlined, kernel
+from valveflow_ros.numerics import copied, inlined, kernel
 from valveflow_ros.partition.moments import (
     BRANCH,
     LEAF,
@@ -61,7 +61,7 @@ SLOTS = 6
 SHARE = 0.499999
 
 
-@kernel
+@copied
 def _window_prior(tree: Tree, first: int, last: int, limit: float, out: FloatArray) -> None:
     """Return Gram matrix and line of the blocks ``[first, last)`` about the sample before them."""
     m = blocks_moments(tree, first, last)
@@ -196,7 +196,7 @@ def _between(lo: float, hi: float, factor: float) -> tuple[float, float]:
     return min(a, b), max(a, b)
 
 
-@kernel
+@copied
 def _lift(
     prior: FloatArray,
     child: FloatArray,
@@ -253,7 +253,7 @@ def _lift(
     out[4] = max(out[4], zl + hi1 + hi2)
 
 
-@inlined
+@copied
 def _lift_flat(child: FloatArray, out: FloatArray) -> None:
     """Widen ``out`` by a child's bound without a line: cost(B) >= cost(part of B)."""
     out[0] = min(out[0], child[0])

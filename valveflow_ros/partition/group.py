@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.numerics import inlined, kernel
+from valveflow_ros.numerics import copied, helper, inlined, kernel
 from valveflow_ros.partition.bounds import SHARE, about_line, least_and_most
 from valveflow_ros.partition.moments import LEAF, Moments, Tree
 from valveflow_ros.records import FloatArray, IntArray
@@ -38,7 +38,7 @@ class Group(NamedTuple):
     keep: IntArray  # (LEAF,) buffer
 
 
-@inlined
+@copied
 def new_group() -> Group:
     """Return working memory."""
     return Group(
@@ -47,7 +47,7 @@ def new_group() -> Group:
     )  # fmt: skip
 
 
-@kernel
+@copied
 def open_group(tree: Tree, block: int, reachable: int, group: Group) -> None:
     """Set up the group that begins at ``block``; ends before ``reachable`` are not needed."""
     first = LEAF * block
@@ -121,7 +121,7 @@ def refresh(group: Group) -> None:
     group.line[6] = min(min(low0, low1), min(low2, low3))
 
 
-@inlined
+@helper
 def bound_about_line(
     group: Group, core: Moments, value: float, slope: float, limit: float
 ) -> None:
@@ -199,7 +199,7 @@ class Near(NamedTuple):
     edge: FloatArray
 
 
-@kernel
+@helper
 def running_costs(tree: Tree, sample: int, last: int, out: FloatArray) -> None:
     """Fill ``out[k]`` with the cost of the samples ``sample..sample + k`` up to ``last``.
 
@@ -223,7 +223,7 @@ def running_costs(tree: Tree, sample: int, last: int, out: FloatArray) -> None:
         out[k] = cost
 
 
-@inlined
+@copied
 def _backward_costs(tree: Tree, first: int, last: int, out: FloatArray) -> None:
     """Fill ``out[i]`` with the cost of the samples ``[first + i, last)``."""
     n = x1 = x2 = y1 = xy = yy = 0.0
@@ -284,7 +284,7 @@ def _adopt_row(
                 breaks[k] = break_
 
 
-@kernel
+@copied
 def _search_edge(
     tree: Tree, edge: FloatArray, before: FloatArray, first: int, at: int, shortest: int,
     room: float, best: FloatArray, breaks: IntArray,
@@ -304,7 +304,7 @@ def _search_edge(
             _adopt_row(cost, before[i], from_, first + i, best, breaks)
 
 
-@kernel
+@copied
 def search_near(
     tree: Tree, near: Near, before: FloatArray, block: int, shortest: int, slack: float,
     best: FloatArray, breaks: IntArray,

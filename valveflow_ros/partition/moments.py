@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.numerics import inlined, kernel
+from valveflow_ros.numerics import helper, inlined, kernel
 from valveflow_ros.records import FloatArray, IntArray
 
 # Samples in a block, which is the smallest node of the tree and one group of ends.
@@ -94,7 +94,7 @@ def fit(m: Moments) -> tuple[float, float, float, bool]:
     return max(cost, 0.0), mean - slope * x1 / n, slope, True
 
 
-@kernel
+@helper
 def blocks_moments(tree: Tree, first: int, last: int) -> Moments:
     """Return the moments of the blocks ``[first, last)``, origin at the last sample."""
     origin = tree.x[LEAF * last - 1]
@@ -113,7 +113,7 @@ def blocks_moments(tree: Tree, first: int, last: int) -> Moments:
     return total
 
 
-@kernel
+@helper
 def stretch_moments(tree: Tree, sample: int, last: int) -> Moments:
     """Return the moments from ``sample`` to the end of block ``last - 1``."""
     block = sample // LEAF

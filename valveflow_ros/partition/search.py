@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.numerics import inlined, kernel, run_in_threads, runs
+from valveflow_ros.numerics import copied, helper, inlined, kernel, run_in_threads, runs
 from valveflow_ros.partition.bounds import SLOTS, fill_leaf_bounds, fill_node_bounds, fill_priors
 from valveflow_ros.partition.group import (
     Group,
@@ -75,7 +75,7 @@ class Layer(NamedTuple):
     bound: FloatArray  # (nodes, SLOTS, 5)
 
 
-@inlined
+@helper
 def _mark_candidates(
     tree: Tree, layer: Layer, block: int, core: Moments, shift: float, group: Group
 ) -> int:
@@ -155,7 +155,7 @@ def _node_part(
     return float(b[0] + (min(b[1] * dr, b[2] * dr) + min(b[3] * dl, b[4] * dl)))
 
 
-@kernel
+@copied
 def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
     """Test all breaks left of a group, near ones first; return the number of leaves opened."""
     origin = tree.x[LEAF * block - 1]
@@ -201,7 +201,7 @@ def _descend(tree: Tree, layer: Layer, block: int, group: Group) -> int:
     return leaves
 
 
-@kernel
+@copied
 def _try_breaks(
     tree: Tree, layer: Layer, block: int, seeds: IntArray, count: int, group: Group
 ) -> None:
@@ -213,7 +213,7 @@ def _try_breaks(
         try_break(group, m, layer.before[break_], break_, first)
 
 
-@inlined
+@copied
 def _collect_breaks(group: Group, seeds: IntArray) -> int:
     """Collect the different breaks of a group; return their number."""
     count = 0

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from valveflow_ros.numerics import jit
+from valveflow_ros.numerics import copied, helper, jit
 from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
 # A line fitted recursively is five running sums over (k, v), k = 0, 1, 2, ... and v taken
@@ -28,13 +28,13 @@ N, ORIGIN, SV, SKV, SVV = range(5)
 LINE_SIZE = 5
 
 
-@jit
+@helper
 def line_reset(line: FloatArray) -> None:
     """Forget all points."""
     line[:] = 0.0
 
 
-@jit
+@helper
 def line_add(line: FloatArray, value: float) -> None:
     """Append the next point."""
     if line[N] == 0.0:
@@ -47,7 +47,7 @@ def line_add(line: FloatArray, value: float) -> None:
     line[SVV] += v * v
 
 
-@jit
+@helper
 def line_fit(line: FloatArray) -> tuple[float, float, float]:
     """Return mean, slope per point, and rms residual (n - 2 degrees of freedom).
 
@@ -69,7 +69,7 @@ def line_fit(line: FloatArray) -> tuple[float, float, float]:
     return mean + line[ORIGIN], slope, math.sqrt(max(rest, 0.0) / (n - 2.0))
 
 
-@jit
+@helper
 def line_ahead(line: FloatArray, steps: float) -> tuple[float, float]:
     """Extrapolate to ``steps`` points after the last one.
 
@@ -101,7 +101,7 @@ WARM_UP = 4  # minimum number of stretches for an estimate
 FORGET_AT = 4000.0  # stretches after which all counts are halved (about three weeks)
 
 
-@jit
+@helper
 def noise_add(histogram: FloatArray, rms: float) -> None:
     """Add one stretch's rms; halve all counts when their sum is large.
 
@@ -115,7 +115,7 @@ def noise_add(histogram: FloatArray, rms: float) -> None:
         histogram *= 0.5
 
 
-@jit
+@helper
 def noise_level(histogram: FloatArray) -> float:
     """Return the noise sd: the quantile, interpolated inside its bin."""
     wanted = QUANTILE * histogram.sum()
@@ -184,7 +184,7 @@ def noise_now(histograms: FloatArray, setting: FloatArray) -> tuple[float, float
     return max(u, 1e-6), max(y, 1e-6)
 
 
-@jit
+@copied
 def _learn(a: Arrays, u: float, y: float) -> None:
     """Add one block to the current noise stretch and close it when it is long enough."""
     state, lines = a.state, a.lines
@@ -200,7 +200,7 @@ def _learn(a: Arrays, u: float, y: float) -> None:
         line_reset(lines[STRETCH_Y])
 
 
-@jit
+@helper
 def _begin(a: Arrays, drop: int, skip: int) -> None:
     """Begin a segment ``drop`` blocks after the old one's first, keeping the later blocks.
 
@@ -221,7 +221,7 @@ def _begin(a: Arrays, drop: int, skip: int) -> None:
         _grow(a)
 
 
-@jit
+@helper
 def _grow(a: Arrays) -> None:
     """Add the block at the end of ``blocks`` to the lines."""
     state, lines, blocks = a.state, a.lines, a.blocks
@@ -234,7 +234,7 @@ def _grow(a: Arrays) -> None:
     state[BLOCKS] = k + 1
 
 
-@jit
+@helper
 def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int) -> int:
     """Return the signed number of consecutive blocks that deviate from the line (0: none)."""
     if line[N] < _LEAST:
@@ -249,7 +249,7 @@ def _leaves(line: FloatArray, value: float, noise: float, limit: float, run: int
     return run + step if run * step >= 0 else step
 
 
-@jit
+@copied
 def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool:
     """Return True if the last minute's mean deviates from the line through the earlier blocks."""
     behind = lines[LINE_U_BEHIND]
@@ -266,7 +266,7 @@ def _drifts(lines: FloatArray, blocks: FloatArray, k: int, noise: float) -> bool
     return abs(off / _BEHIND) > _BEHIND_LIMIT * sd
 
 
-@jit
+@copied
 def _judge(a: Arrays, first: int, end: int, noise_u: float, noise_y: float) -> int:
     """Classify the blocks ``[first, end)``: 0 none, 1 steady state, 2 slope response."""
     blocks, setting, found = a.blocks, a.setting, a.found
@@ -295,7 +295,7 @@ def _judge(a: Arrays, first: int, end: int, noise_u: float, noise_y: float) -> i
     return 0
 
 
-@jit
+@helper
 def _close(a: Arrays, end: int) -> bool:
     """Classify the open segment up to block ``end``; True if it is a special segment."""
     state, setting, found = a.state, a.setting, a.found
@@ -317,7 +317,7 @@ def _close(a: Arrays, end: int) -> bool:
     return True
 
 
-@jit
+@copied
 def _take_block(a: Arrays) -> bool:
     """Process the block at the end of ``blocks``; True if that closed a special segment."""
     state, lines, blocks, setting = a.state, a.lines, a.blocks, a.setting
@@ -349,7 +349,7 @@ def _take_block(a: Arrays) -> bool:
     return closed
 
 
-@jit
+@copied
 def _cut_if_long(a: Arrays) -> bool:
     """Close a segment that has become too long; True if it is a special segment.
 
@@ -369,7 +369,7 @@ def _cut_if_long(a: Arrays) -> bool:
     return closed
 
 
-@jit
+@copied
 def _kind_now(a: Arrays) -> int:
     """Return the kind of the newest row, as far as known now."""
     state = a.state
@@ -383,7 +383,7 @@ def _kind_now(a: Arrays) -> int:
     return SETTLED_SLOPE if moved >= a.setting[SLOPE] else SETTLED_STEADY
 
 
-@jit
+@copied
 def _break_off(a: Arrays) -> bool:
     """Close the open segment at a gap, because the operation in the gap is unknown.
 
@@ -403,7 +403,7 @@ def _break_off(a: Arrays) -> bool:
     return closed
 
 
-@jit
+@copied
 def _take_row(a: Arrays, u: float, y: float, temperature: float) -> bool:
     """Add a row to the current block; True if that closed a special segment."""
     state, sums, blocks = a.state, a.sums, a.blocks

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from valveflow_ros import state
-from valveflow_ros.numerics import inlined, jit
+from valveflow_ros.numerics import copied, helper, inlined, jit
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     N_SIGNALS,
@@ -100,7 +100,6 @@ class AlignedRows(NamedTuple):
     time_ns: IntArray
     values: FloatArray
     quality: ByteArray
-    resets: IntArray
 
 
 @inlined
@@ -178,7 +177,7 @@ def _close(state: State, rules: Rules, rows: AlignedRows, place: int, coming_ns:
     return False
 
 
-@jit
+@helper
 def _drop_waiting(state: State) -> None:
     """Drop and count the waiting readings that were not confirmed."""
     for k in range(state.clock[_WAITING]):
@@ -186,7 +185,7 @@ def _drop_waiting(state: State) -> None:
     state.clock[_WAITING] = 0
 
 
-@jit
+@copied
 def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) -> int:
     """Add a reading far off in time to the waiting ones; 1 confirms a jump ahead, -1 one back."""
     clock = state.clock
@@ -209,7 +208,7 @@ def _wait(state: State, rules: Rules, time_ns: int, s: int, v: float, q: int) ->
     return 1 if ahead else -1
 
 
-@jit
+@copied
 def _forget(state: State) -> None:
     """Reset after a step back of the clock; the waiting readings are confirmed."""
     state.clock[_RESETS] += 1
@@ -220,7 +219,7 @@ def _forget(state: State) -> None:
     state.open_row[:] = NEVER
 
 
-@jit
+@helper
 def _close_ready(
     state: State, rules: Rules, rows: AlignedRows, written: int, coming_ns: int, rest: bool
 ) -> int:
@@ -243,7 +242,7 @@ def _close_ready(
     return written
 
 
-@inlined
+@copied
 def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
     """Return why a reading is rejected, or `_ACCEPTED`."""
     if not 0 <= t < _LATEST_NS:
@@ -257,17 +256,14 @@ def _refusal(t: int, v: float, q: int, low: float, high: float) -> int:
 
 @jit
 def _offer_believed(state: State, rules: Rules, rows: AlignedRows, written: int) -> int:
-    """Accept the readings of a confirmed jump.
-
-    Return the rows written, or -1 - rows if space ended before all were accepted.
-    """
+    """Accept the readings of a confirmed jump while there is space; return the rows written."""
     clock = state.clock
     while 0 <= clock[_BELIEVED] < clock[_WAITING]:
         k = clock[_BELIEVED]
         t = state.wait_ns[k]
         written = _close_ready(state, rules, rows, written, t, False)
         if written >= rows.time_ns.size - rules.spare:
-            return -1 - written
+            return written
         _accept(state, rules, t, state.wait_signal[k], state.wait[k], state.wait_quality[k])
         clock[_BELIEVED] += 1
     if clock[_BELIEVED] >= 0:
@@ -287,17 +283,7 @@ def _go_back(state: State, rules: Rules, rows: AlignedRows, written: int) -> int
 
 
 @jit
-def _far(
-    state: State, rules: Rules, rows: AlignedRows, written: int, t: int, s: int, v: float, q: int
-) -> int:
-    """Process a reading far off in time; return the rows written."""
-    leap = _wait(state, rules, t, s, v, q)
-    state.clock[_BELIEVED] = 0 if leap != 0 else -1
-    return _go_back(state, rules, rows, written) if leap < 0 else written
-
-
-@jit
-def align(  # noqa: C901 - one loop with all cases of a reading
+def _align(
     time_ns: IntArray,
     signal: NDArray[np.int8],
     value: FloatArray,
@@ -305,21 +291,19 @@ def align(  # noqa: C901 - one loop with all cases of a reading
     state: State,
     rules: Rules,
     rows: AlignedRows,
+    i: int,
+    written: int,
     final: bool,
 ) -> tuple[int, int, int]:
-    """Process readings until they or the space for rows end.
+    """Process readings from ``i`` on until they or the space for rows end, or a jump is confirmed.
 
-    Return the number of readings processed, of rows written and of resets.
+    Return the number of readings processed, of rows written, and 1 for a jump ahead, -1 for one
+    back, else 0. A jump is left to the caller: it is rare, and its loops take long to compile.
     """
     # Calls with many arrays are slow, so the common path first checks if a call is needed.
     clock = state.clock
     limit = rows.time_ns.size - rules.spare
-    written = resets = i = 0
     while True:
-        if clock[_BELIEVED] >= 0:
-            written = _offer_believed(state, rules, rows, written)
-            if written < 0:
-                return i, -1 - written, resets
         last = i >= time_ns.size
         if clock[NEWEST] >= clock[_NEXT] and ((final and last) or _can_close(state, rules)):
             written = _close_ready(state, rules, rows, written, _LATEST_NS, final and last)
@@ -339,15 +323,13 @@ def align(  # noqa: C901 - one loop with all cases of a reading
             if clock[_WAITING] > 0:
                 _drop_waiting(state)
         else:
-            before = clock[_RESETS]
-            written = _far(state, rules, rows, written, t, s, v, q)
-            if clock[_RESETS] > before:
-                rows.resets[resets] = written
-                resets += 1
+            leap = _wait(state, rules, t, s, v, q)
+            if leap != 0:
+                return i + 1, written, leap
         i += 1
     if final and i >= time_ns.size:
         _drop_waiting(state)
-    return i, written, resets
+    return i, written, 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,15 +448,9 @@ class Aligner:
                 np.empty(room, dtype=np.int64),
                 np.empty((room, N_SIGNALS)),
                 np.empty((room, N_SIGNALS), dtype=np.uint8),
-                np.empty(max(1, len(readings)), dtype=np.int64),
             )
-            rest = readings.part(done, len(readings))
-            consumed, written, n_resets = align(
-                rest.time_ns, rest.signal, rest.value, rest.quality,
-                self._state, self._rules, rows, final,
-            )  # fmt: skip
-            done += consumed
-            resets += [before + int(k) for k in rows.resets[:n_resets]]
+            done, written, jumps = self._fill(readings, done, rows, final)
+            resets += [before + k for k in jumps]
             before += written
             tables.append(
                 SampleTable(rows.time_ns[:written], rows.values[:written], rows.quality[:written])
@@ -487,6 +463,33 @@ class Aligner:
             beside = [self._beside.at(table.time_ns[start:end]) for start, end in edges]
             table = replace(table, covariates=np.concatenate(beside))
         return Aligned(table, np.array(resets, dtype=np.int64))
+
+    def _fill(
+        self, readings: Readings, done: int, rows: AlignedRows, final: bool
+    ) -> tuple[int, int, list[int]]:
+        """Process readings from ``done`` on until they or the space for rows end.
+
+        Return the number of readings processed, of rows written, and the resets among these.
+        """
+        state, rules, clock = self._state, self._rules, self._state.clock
+        written = 0
+        resets: list[int] = []
+        while True:
+            if clock[_BELIEVED] >= 0:
+                written = _offer_believed(state, rules, rows, written)
+                if clock[_BELIEVED] >= 0:
+                    break
+            done, written, leap = _align(
+                readings.time_ns, readings.signal, readings.value, readings.quality,
+                state, rules, rows, done, written, final,
+            )  # fmt: skip
+            if leap == 0:
+                break
+            clock[_BELIEVED] = 0
+            if leap < 0:
+                written = _go_back(state, rules, rows, written)
+                resets.append(written)
+        return done, written, resets
 
 
 # Alignment of a whole log without the engine, which takes long to load.
