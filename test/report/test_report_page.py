@@ -87,9 +87,10 @@ def test_gain_by_load_is_the_slope_of_the_power_over_the_opening(identified, for
     data = identified
     if form:
         v = data.table.column(Signal.VALVE_OPENING)
+        slope, intercept = np.polyfit(v, data.power / 12.0**1.1, 1).tolist()
         piece = replace(
             data.characteristic.pieces[0], u_from=float(v.min()) - 1.0,
-            u_to=float(v.max()) + 1.0, slope=0.2, slope_stderr=0.01,
+            u_to=float(v.max()) + 1.0, slope=slope, intercept=intercept, slope_stderr=0.01,
         )  # fmt: skip
         data = with_curve(data, **form, pieces=(piece,), partition_pieces=(piece,))
     rows = gain_by_load(data)
