@@ -50,7 +50,7 @@ def test_a_test_at_one_pressure_says_that_it_does_not_tell_the_form() -> None:
     frame = flow_test(3)
     frame['main_steam_pressure_mpa'] += np.linspace(0.0, 0.4, len(frame))
     found = vf.identify(frame)
-    (told,) = [n for n in found.characteristic.notes if 'F(V p^m)' in n]
+    (told,) = [n for n in found.characteristic.notes if 'at other pressures' in n]
     assert told.startswith('The pressure stayed between 16.70 and 17.10 MPa')
     assert told.replace("'", '&#x27;') in found.page().to_html()
 

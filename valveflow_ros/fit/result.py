@@ -255,6 +255,7 @@ NOT_REFINED = 'The curve is not refined: '  # beginning of a note on that
 _SMALL = 0.05  # half of a small 95 % interval, relative to the slope
 _MOST_PERCENT = 100.0  # an opening beyond it is no advice
 _LEAST_ROWS = 30  # minimum rows of a segment inside a piece to be counted
+_SAME_MW = 0.01  # a smaller difference of two forms is not given in numbers
 _APART = 10.0  # minimum difference of two distinct levels, in noise sd of u
 
 
@@ -298,6 +299,8 @@ def wrong_form(c: Characteristic) -> str:
 def forms_apart(form: FormEvidence) -> str:
     """Return a phrase on how much the two forms differ, and where most."""
     opening, pressure, most = form.worst
+    if abs(most) < _SAME_MW:
+        return 'both give the same power at the pressures of these data'
     return (
         f'the two differ by {form.apart_mw:.2g} MW (root mean square), at {opening:.0f} % and '
         f'{pressure:.1f} MPa by {most:.2g} MW'

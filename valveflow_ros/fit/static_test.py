@@ -211,8 +211,8 @@ def _characteristic(
     gaps = zip(line.knots[1:-1].tolist(), line.knot_error.tolist(), strict=True)
     note = (
         f'The table was taken as a static test: {len(rows)} steady rows, '
-        f'{counted(step_s, "s", "s")} apart or more, at {float(pressure.mean()):.2f} MPa. Steady '
-        'rows tell no time constant and no delay.'
+        f'{counted(step_s, "s", "s")} apart or more. Steady rows show no time constant and no '
+        'delay.'
     )
     return Characteristic(
         pressure_exponent=settings.real('pressure_exponent'),

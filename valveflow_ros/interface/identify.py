@@ -219,7 +219,7 @@ def _identified(
             return Identified(
                 source=log.name, characteristic=test.characteristic, table=read,
                 segments=test.segments, counts=counts, settings=settings,
-                notes=(*log.notes, *notes),
+                notes=(*log.notes, *notes), one_pressure=_one_pressure(log),
             )  # fmt: skip
         if looks_like_step_test(table, settings):
             raise DataError(f'{error} {STEP_TEST_ADVICE}') from None
@@ -240,7 +240,7 @@ def _identified(
         source=log.name, characteristic=characteristic, table=observed.table,
         segments=observed.segments, counts=observed.counts, settings=settings,
         notes=(*log.notes, *notes, *told), mixture=mixture,
-        history=recorded_history(log.contents),
+        history=recorded_history(log.contents), one_pressure=_one_pressure(log),
     )  # fmt: skip
     misfit = find_misfit(
         *_inputs(found.table), found.power - found.static_mw, found.power, found.rows,
@@ -277,6 +277,13 @@ def _of_compressed(c: Characteristic, log: Log) -> Characteristic:
     return replace(c, notes=(*(n for n in c.notes if n not in said), hidden))
 
 
+def _one_pressure(log: Log) -> bool:
+    """Return True if the pressure is one value throughout, as a constant given by the user."""
+    r = log.readings
+    pressure = r.value[(r.signal == Signal.MAIN_STEAM_PRESSURE) & np.isfinite(r.value)]
+    return bool(len(pressure)) and float(np.ptp(pressure)) == 0.0
+
+
 def _inputs(table: SampleTable) -> tuple[FloatArray, FloatArray]:
     """Return opening and pressure."""
     return table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE)
@@ -304,4 +311,5 @@ def _step_test(log: Log, given: Mapping[str, Any], progress: Progress) -> Identi
     return Identified(
         source=log.name, characteristic=test.characteristic, table=table,
         segments=test.segments, counts=counts, settings=settings, notes=(*log.notes, *notes),
+        one_pressure=_one_pressure(log),
     )  # fmt: skip

@@ -13,6 +13,8 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic, Choice, RegionDynamics, piece_of
 from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.fit.result import forms_apart, is_borrowed, wrong_form
+from valveflow_ros.fit.static_test import STATIC_RULE
+from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report import figure as plot
 from valveflow_ros.report import page as html
@@ -20,7 +22,7 @@ from valveflow_ros.report import words as say
 from valveflow_ros.report.figure import Figure, Spec
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.words import NOT_KNOWN, Z95
-from valveflow_ros.signals.static_form import OPENING
+from valveflow_ros.signals.static_form import LEAST_PRESSURE_RANGE, OPENING, pressure_range
 
 # Below this explained fraction of the power, it depends on something else, or a signal is wrong.
 _LITTLE = 0.8
@@ -87,9 +89,11 @@ def misfit_words(misfit: Misfit) -> str:
     )
 
 
-def form_words(c: Characteristic) -> str:
+def form_words(data: Identified) -> str:
     """Return the form of the power and its evidence; empty for the paper's form if confirmed."""
-    form = c.form
+    c, form = data.characteristic, data.characteristic.form
+    if data.one_pressure and c.choice.rule not in (RULE, STATIC_RULE):  # they have a note
+        return 'The pressure is the same in all rows: the curve holds at that pressure only.'
     if form is None or form.contradicted:
         return ''
     mine = c.static_form.words
@@ -190,28 +194,30 @@ def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
         ]
         for g in gain_by_load(data)
     ]  # fmt: skip
+    if data.one_pressure:  # then there is no range of pressures
+        head, *cells = ([row[0], *row[3:6]] for row in (head, *cells))
     return head, cells
 
 
 def gain_table(data: Identified) -> str:
     """Return the table of MW per % of opening by load; empty without data for it."""
     head, cells = gain_cells(data)
-    caption = (
-        'MW per 1 % of opening at each load. The opening is the one that gives the load at the '
-        'median pressure. The usual range holds nine tenths of the time at this load; it is wide '
-        'if the unit at times holds a higher pressure in reserve.'
-    )
+    caption = 'MW per 1 % of opening at each load.'
+    if not data.one_pressure:
+        caption += (
+            ' The opening is the one that gives the load at the median pressure. The usual range '
+            'of the pressure holds for nine tenths of the time at this load; it is wide if the '
+            'unit at times keeps a higher pressure.'
+        )
     return html.table(head, cells, caption=caption) if cells else ''
 
 
 def answer_words(data: Identified) -> str:
     """Return a summary paragraph for an engineer, with the risks of the result."""
     c = data.shown
-    ends, values, m = c.breakpoints, c.values(), c.pressure_exponent
     words = (
-        f'The flow characteristic has <b>{say.counted(len(c.pieces), "piece")}</b> and is known '
-        f'from {say.span(values[0], values[-1])} MW{data.at_pressure} ({say.input_name(m)} from '
-        f'{say.span(ends[0], ends[-1])} {say.input_unit(m)}).{_bends(c)} It explains '
+        f'The flow characteristic has <b>{say.counted(len(c.pieces), "piece")}</b>. '
+        f'{range_words(data)}{_bends(c)} It explains '
         f'{say.percent(explained(data))} of the variance of the power in '
         f'{say.counted(c.source.steady, "steady-state segment")} and '
         f'{say.counted(c.source.slope_response, "slope-response segment")} '
@@ -229,15 +235,35 @@ def answer_words(data: Identified) -> str:
         )
     if any(p.slope <= 0.0 for p in c.pieces):
         told.append(
-            'On one piece the power does not rise with u, so the curve has no inverse there and '
-            'cannot be compensated. A flat upper end is normal; a falling piece elsewhere is not.'
+            'On one piece the power does not rise with '
+            f'{say.input_name(c.pressure_exponent)}, so the curve has no inverse there and cannot '
+            'be compensated. A flat upper end is normal; a falling piece elsewhere is not.'
         )
     told += [html.text(n) for n in (say.held_words(c.held), *c.notes)]
-    form = form_words(data.characteristic)
+    form = form_words(data)
     doubts = doubt(data)
     said = html.notice(html.text(doubts)) if doubts else ''
     said += html.paragraph(words, 'answer') + (html.paragraph(html.text(form)) if form else '')
     return said + ''.join(html.notice(n) for n in told if n)
+
+
+def range_words(data: Identified) -> str:
+    """Return the ends of the curve in a sentence: openings if the pressure was nearly constant."""
+    c, unit = data.shown, data.characteristic.output_unit
+    ends, m = c.breakpoints[[0, -1]], c.pressure_exponent
+    power = f'{say.span(*c.values()[[0, -1]])} {unit}'
+    pressure = data.table.column(Signal.MAIN_STEAM_PRESSURE)[data.special]
+    over_u = '' if m == 0.0 else f'u from {say.span(*ends)} {say.input_unit_plain(m)}'
+    if m == 0.0:
+        opening, at = ends, '' if data.one_pressure else data.at_pressure
+    elif len(pressure) and pressure_range(pressure) < LEAST_PRESSURE_RANGE:
+        usual = float(np.median(pressure))
+        opening, at = ends / usual**m, f' at {usual:.3g} MPa'
+    else:
+        return f'The curve is known from {power} ({over_u}).'
+    known = f'The curve is known from {say.decimals(float(opening[0]), 1)} % to '
+    known += f'{say.decimals(float(opening[1]), 1)} % opening{at}: from {power}'
+    return f'{known} ({over_u}).' if over_u else f'{known}.'
 
 
 def _bends(c: Characteristic) -> str:
