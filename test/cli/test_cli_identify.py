@@ -344,3 +344,8 @@ def test_of_two_measured_loops_one_carries_a_curve(run, shared_data, tmp_path):
     said = run('identify', tmp_path / 'FT_211.mcap', '-o', tmp_path / 'none').refused()
     assert 'hardly follows the valve' in said
     assert not (tmp_path / 'none').exists()
+    said = run('diagnose', tmp_path / 'FT_211.mcap', '-o', tmp_path / 'why').done().out
+    first = said.splitlines()[0]
+    assert 'something is unexplained. The flow hardly follows the valve' in first
+    assert 'depends on how far the valve moved in the last 3 min, and no cause' in first
+    assert said.count('region_lag') == 1, 'what could not be checked is listed once'

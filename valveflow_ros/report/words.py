@@ -193,7 +193,7 @@ def in_zone(said: str, zone: tzinfo | None) -> str:
 
 def floor_words(disturbed: bool) -> str:
     """Return what the estimate of the noise floor contains."""
-    return 'noise and the slow variation' if disturbed else 'noise alone'
+    return 'Noise and the slow variation' if disturbed else 'Noise alone'
 
 
 def period(start_ns: int, end_ns: int) -> str:
