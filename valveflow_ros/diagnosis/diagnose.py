@@ -813,8 +813,8 @@ def _sentence(d: Diagnosis) -> str:
         slow = '' if d.disturbance is None else 'a slow disturbance and '
         but = f', {len(blind)} {unseen}' if blind else ''
         return (
-            f'No cause was found: {len(catalogue()) - len(blind)} were checked{but}. The remaining '
-            f'difference between model and measurement is {slow}noise.{wander}'
+            f'No cause was found: {len(catalogue()) - len(blind)} were checked{but}. The '
+            f'remaining difference between model and measurement is {slow}noise.{wander}'
         )
     but = f' {counted(len(blind), "cause")} {unseen}.' if blind else ''
     near = f' Most similar: {", ".join(d.not_told_apart)}.' if d.not_told_apart else ''

@@ -32,10 +32,7 @@ CONTRADICTED_GAIN = 25.0
 LEAST_ANSWER = 3.0
 """Log-likelihood by which the command must help to predict the response."""
 LEAST_PERIODS = 3.0
-_DOUBT = (
-    'A process that changes unmeasured, such as a varying supply pressure, can look the same: '
-    'to decide, put the controller in manual and make steps in both directions.'
-)
+_DOUBT = 'A process that changes unmeasured, such as a varying supply pressure, can look the same.'
 _MOST_ROWS = 20_000
 _WINDOW_ROWS = 1000  # the thresholds were determined on windows of 751 rows
 _MOST_FILLED = 3
@@ -389,10 +386,11 @@ def _concluded(
     asked = CONTRADICTED_GAIN if horch.answer == NO_STICTION else LEAST_GAIN
     if found.gain >= asked or found.travel >= LEAST_TRAVEL:
         seen = (
-            'a valve that stays behind explains the process value where the command alone does not'
+            'a valve that lags behind its command explains the process value better than the '
+            'command does'
             if found.gain >= asked
-            else 'the process value stands while the command travels, and moves after it has gone '
-            f'about {found.band:.2g} further'
+            else 'after a reversal the process value stands still until the command has moved '
+            f'about {found.band:.2g} % further'
         )
         if horch.answer == STICTION:
             seen += "; Horch's cross-correlation says the same"
@@ -400,20 +398,24 @@ def _concluded(
         clear = abs(found.jump_gain) >= plug.CLEAR_JUMP_GAIN
         fits = f'{better} fits better' if clear else 'both fit alike'
         return 'stiction', (
-            f'The valve sticks or has slack: {seen}. Which of the two only a measured position '
-            f'tells; here {fits}.'
+            f'The valve sticks or has slack: {seen}. Only a measured position can tell which of the '
+            f'two; here {fits}.'
         )
     if found.of_command < LEAST_ANSWER:
-        return NOT_JUDGED, 'The process value does not answer to the command.'
+        return (
+            NOT_JUDGED,
+            'The process value does not follow the command: check that both are of one loop.',
+        )
     if not regular and turns < 2.0 * LEAST_PERIODS - 1.0:
         return NOT_JUDGED, (
-            f'The command turned round {"once" if turns == 1 else f"{turns} times"}, which is '
-            f'fewer than {LEAST_PERIODS:.0f} full swings: no fault of the valve shows, but so few '
-            'do not show that it is sound.'
+            f'The command changed its direction {"once" if turns == 1 else f"{turns} times"}; '
+            f'{2.0 * LEAST_PERIODS - 1.0:.0f} changes ({LEAST_PERIODS:.0f} full swings) are '
+            'needed. No fault of the valve shows, but so few changes do not prove that it is '
+            'sound: take a longer record.'
         )
     if regular:
         return OSCILLATING, (
-            'no stick band or slack shows: the controller is tuned tightly, or the swing comes '
+            'no stick band or slack shows: the controller is tuned too tightly, or the swing comes '
             'from outside.'
         )
     return HEALTHY, 'The process value follows the command; no stick band or slack shows.'
