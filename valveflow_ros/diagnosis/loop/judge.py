@@ -158,7 +158,7 @@ def _judged(
     verdict, reason = _concluded(found, horch, turns, regular)
     period_s = swing.period * step_s if regular else np.nan
     if verdict == OSCILLATING:
-        reason = f'The loop swings with a period of {_seconds(period_s)} and {reason}'
+        reason = f'The loop swings with a period of {_seconds(period_s)}; {reason}'
         if aim is not None and _swings_along(aim, swing.period):
             reason += ' The set point swings with the same period: the cause lies before the loop.'
     asked = _asked(c, y, swing.period, horch) if regular else {}
@@ -247,7 +247,7 @@ def _of_fault(fault: actuator.ActuatorFault | None, rows: int) -> LoopJudgement:
     if fault is None:
         return LoopJudgement(
             HEALTHY,
-            'The position follows the command without stick band or slack; a loose linkage behind '
+            'The position follows the command without sticking or slack; a loose linkage behind '
             'the position sensor would not show.',
             rows=rows,
         )
@@ -398,8 +398,8 @@ def _concluded(
         clear = abs(found.jump_gain) >= plug.CLEAR_JUMP_GAIN
         fits = f'{better} fits better' if clear else 'both fit alike'
         return 'stiction', (
-            f'The valve sticks or has slack: {seen}. Only a measured position can tell which of the '
-            f'two; here {fits}.'
+            f'The valve sticks or has slack: {seen}. Only a measured position can tell which of '
+            f'the two; here {fits}.'
         )
     if found.of_command < LEAST_ANSWER:
         return (
@@ -408,17 +408,17 @@ def _concluded(
         )
     if not regular and turns < 2.0 * LEAST_PERIODS - 1.0:
         return NOT_JUDGED, (
-            f'The command changed its direction {"once" if turns == 1 else f"{turns} times"}; '
-            f'{2.0 * LEAST_PERIODS - 1.0:.0f} changes ({LEAST_PERIODS:.0f} full swings) are '
-            'needed. No fault of the valve shows, but so few changes do not prove that it is '
-            'sound: take a longer record.'
+            f'The command reversed by {100.0 * _TURN:.0f} % of its range or more '
+            f'{"once" if turns == 1 else f"{turns} times"}; {2.0 * LEAST_PERIODS - 1.0:.0f} '
+            f'reversals ({LEAST_PERIODS:.0f} full swings) are needed. No fault of the valve '
+            'shows, but so few reversals do not prove that it is sound: take a longer record.'
         )
     if regular:
         return OSCILLATING, (
-            'no stick band or slack shows: the controller is tuned too tightly, or the swing comes '
-            'from outside.'
+            'the valve shows no sign of sticking or slack: the controller is tuned too tightly, '
+            'or the swing comes from outside.'
         )
-    return HEALTHY, 'The process value follows the command; no stick band or slack shows.'
+    return HEALTHY, 'The process value follows the command, without a sign of sticking or slack.'
 
 
 def _swings_along(aim: FloatArray, period: float) -> bool:
