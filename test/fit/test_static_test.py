@@ -111,6 +111,27 @@ def test_what_is_no_static_test_is_refused(change) -> None:
         vf.identify(flow_test(1).assign(**change))
 
 
+def test_an_impossible_opening_is_no_row_of_a_static_test() -> None:
+    frame = flow_test(1)
+    frame.loc[len(frame) - 3 :, 'valve_opening_percent'] = (140.0, 150.0, 160.0)
+    found = vf.identify(frame).characteristic
+    assert found.source.steady == len(frame) - 3
+    assert found.breakpoints[-1] < 105.0 * frame['main_steam_pressure_mpa'].max() ** 1.125
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'valve_opening_percent': 50.0}, 'valve_opening is 50 % in all rows'),
+        ({'generated_power_mw': 200.0}, 'generated_power is 200 MW in all rows'),
+        ({'time': pd.Timestamp('2026-01-01', tz='UTC')}, 'Only one time, 2026-01-01 00:00:00 UTC'),
+    ],
+)
+def test_what_does_not_move_is_named(change, words) -> None:
+    with pytest.raises(DataError, match=words):
+        vf.identify(flow_test(1).assign(**change))
+
+
 def test_too_few_rows_are_told_in_rows() -> None:
     """The floor is told in rows of the table as read, and in time."""
     with pytest.raises(DataError, match=r'11 usable rows, .* 4 stretches of 42 rows \(42 min\)'):

@@ -104,6 +104,11 @@ def find_static_test(table: SampleTable, settings: Settings) -> StaticTest | Non
     return StaticTest(_characteristic(table, u, rows, line, rest, settings), segments)
 
 
+def may_be_static_test(table: SampleTable, settings: Settings) -> bool:
+    """Return True for a table with rows as far apart and as few as those of a static test."""
+    return settings.real('sample_period') >= COARSE_STEP_S and len(table) <= _MOST_ROWS
+
+
 def _rows(opening: FloatArray, pressure: FloatArray, power: FloatArray) -> IntArray:
     """Return the indices of rows with all values, without repetitions of the previous row."""
     values = np.column_stack([opening, pressure, power])

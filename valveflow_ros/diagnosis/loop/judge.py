@@ -17,7 +17,7 @@ import numpy as np
 
 from valveflow_ros.diagnosis.loop import actuator, detectors, plug
 from valveflow_ros.diagnosis.loop.detectors import NO_STICTION, STICTION, Detection
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, counted
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 HEALTHY, OSCILLATING, NOT_JUDGED = 'healthy', 'oscillating', 'not_judged'
@@ -408,10 +408,10 @@ def _concluded(
         )
     if not regular and turns < 2.0 * LEAST_PERIODS - 1.0:
         return NOT_JUDGED, (
-            f'The command reversed by {100.0 * _TURN:.0f} % of its range or more '
-            f'{"once" if turns == 1 else f"{turns} times"}; {2.0 * LEAST_PERIODS - 1.0:.0f} '
-            f'reversals ({LEAST_PERIODS:.0f} full swings) are needed. No fault of the valve '
-            'shows, but so few reversals do not prove that it is sound: take a longer record.'
+            f'The command had {counted(turns, "reversal")} of {100.0 * _TURN:.0f} % of its range '
+            f'or more; {2.0 * LEAST_PERIODS - 1.0:.0f} are needed ({LEAST_PERIODS:.0f} full '
+            'swings). No fault of the valve shows, but so few reversals do not prove that it is '
+            'sound: take a longer record.'
         )
     if regular:
         return OSCILLATING, (
