@@ -274,18 +274,20 @@ def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
             f'Only one time, {moment(int(table.time_ns[good][0]))}, has opening, pressure and '
             'power: is it the right column of times?'
         )
+    step_s = settings.real('sample_period')
+    coarse = step_s >= COARSE_STEP_S
     for signal in (Signal.VALVE_OPENING, Signal.GENERATED_POWER):
         values = table.column(signal)[good]
-        if len(values) and np.ptp(values) == 0.0:
+        # Of a short log the length is to be told.
+        if (learnt or coarse) and len(values) and np.ptp(values) == 0.0:
             return (
                 f'{SIGNALS[signal].topic} is {values[0]:g} {SIGNALS[signal].unit} in all rows: a '
                 'curve needs several openings and the power at each.'
             )
     usable, longest = int(good.sum()), _longest_run(table.time_ns[good], settings)
-    span = duration(usable * settings.real('sample_period'))
+    span = duration(usable * step_s)
     if not learnt:
-        stretch_s, step_s = WINDOW * settings.real('block'), settings.real('sample_period')
-        coarse = step_s >= COARSE_STEP_S
+        stretch_s = WINDOW * settings.real('block')
         have = (
             f'{counted(usable, "usable row")}, one every {duration(step_s)}'
             if coarse
