@@ -386,28 +386,32 @@ def _sentence(
     many = len(weak) > 1
     places = [(piece, u) for _, piece, found in weak for u in _missing(piece, found.levels)]
     loads = [_operation(c, piece, u, short_of=many) for piece, u in places]
-    if not many:
-        ((number, piece, found),) = weak
-        if rests == _AT_ENDS:
-            rests += f', only {counted(found.samples, "sample")} at the ends of others'
-        name = f'Piece {number} ({c.place_words(piece.u_from, piece.u_to)}) has {rests}'
-        tail = f'at about {" and one at ".join(loads)} would'
-    else:
+    if many:
         name = f'Pieces {listed([str(number) for number, _, _ in weak])} have '
         name += rests.replace('its own', 'their own')
-        tail = f'at each of about {listed(loads)} MW would'
-    its, slope, error, it, the = (
-        ('their', 'slopes follow', 'errors hold', 'them', 'each') if many
-        else ('its', 'slope follows', 'error holds', 'it', 'the')
-    )  # fmt: skip
+        if borrowed:
+            return (
+                f'{name}: their slopes follow from the pieces beside them, and their errors hold '
+                'if each piece is straight. One hour of constant operation at each of about '
+                f'{listed(loads)} MW would check them.'
+            )
+        return (
+            f'{name}, so their slopes are uncertain. One hour of constant operation at each of '
+            f'about {listed(loads)} MW would give them.'
+        )
+    ((number, piece, found),) = weak
+    if rests == _AT_ENDS:
+        rests += f', only {counted(found.samples, "sample")} at the ends of others'
+    name = f'Piece {number} ({c.place_words(piece.u_from, piece.u_to)}) has {rests}'
+    load = ' and one at '.join(loads)
     if borrowed:
         return (
-            f'{name}: {its} {slope} from the pieces beside {it}, and {its} {error} if {the} piece '
-            f'is straight. One hour of constant operation {tail} check {it}.'
+            f'{name}: its slope follows from the pieces beside it, and its error holds if the '
+            f'piece is straight. One hour of constant operation at about {load} would check it.'
         )
-    uncertain = 'slopes are' if many else 'slope is'
     return (
-        f'{name}, so {its} {uncertain} uncertain. One hour of constant operation {tail} give {it}.'
+        f'{name}, so its slope is uncertain. One hour of constant operation at about {load} would '
+        'give it.'
     )
 
 

@@ -20,6 +20,7 @@ needed. DIR gets loop.json.
 
 example:
   valveflow loop FIC101.csv -o result
+
 with column names that the program cannot recognise:
   valveflow loop trend.csv -o result --command A17 --process A18"""
 
