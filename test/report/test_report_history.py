@@ -78,7 +78,8 @@ def test_the_story_is_told_in_two_sections_and_a_log_of_no_monitor_has_none():
     words = words_of(history())
     # The condition stood from hour 14 to hour 20.
     for part in (
-        '5 curves', '5 changes of 1 alarm and 1 diagnosis', 'Some alarm was active for 6 h in all.',
+        '5 curves', '5 changes of 1 alarm and 1 diagnosis',
+        'Some alarm was active for 6 h in all.',
         html.escape('6 MW less & it <lasts>'),
     ):  # fmt: skip
         assert part in words, part
