@@ -182,7 +182,8 @@ def test_a_log_without_a_signal_names_the_two_options(run, logs, tmp_path):
         logs / 'plant.csv', tmp_path / 'x.csv', 'main_steam_pressure_mpa', lambda _, p: p, 'P'
     )
     sentence = run('identify', tmp_path / 'x.csv', '-o', tmp_path / 'out').refused()
-    assert '--column main_steam_pressure=THEIRS[:unit], or give --constant' in sentence
+    assert '--column main_steam_pressure=THEIRS[:unit]; for a control valve with' in sentence
+    assert sentence.endswith('flow only, add --constant main_steam_pressure=1.')
     option = ('--column', 'main_steam_pressure=P:MPa')
     ran = run('info', tmp_path / 'x.csv', *option, '--json')
     assert ran.json['signals']['main_steam_pressure']['low'] > 0.0
@@ -336,6 +337,15 @@ def test_of_two_measured_loops_one_carries_a_curve(run, shared_data, tmp_path):
     (piece,) = found['pieces']
     assert piece['slope'] > 0.0
     assert found['sample_period_s'] == 60.0
+    page = (tmp_path / 'out' / 'report.html').read_text(encoding='utf-8')
+    assert 'opening (%)' in page
+    assert 'The pressure is the same in all rows' in page
+    assert not re.search(r'% MPa<sup>|integrated input|differ by|e-1\d', page)
     said = run('identify', tmp_path / 'FT_211.mcap', '-o', tmp_path / 'none').refused()
     assert 'hardly follows the valve' in said
     assert not (tmp_path / 'none').exists()
+    said = run('diagnose', tmp_path / 'FT_211.mcap', '-o', tmp_path / 'why').done().out
+    first = said.splitlines()[0]
+    assert 'something is unexplained. The flow hardly follows the valve' in first
+    assert 'depends on how far the valve moved in the last 3 min, and no cause' in first
+    assert said.count('region_lag') == 1, 'what could not be checked is listed once'

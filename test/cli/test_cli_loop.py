@@ -49,7 +49,9 @@ def test_the_file_keeps_its_contract_and_words_say_it(loop, frame, tmp_path):
     assert set(content) >= {'reason', 'sizes'}
     assert content['columns']['set_point'] == 'FIC101.SV'
     out = loop(frame).out
-    assert out.startswith('FIC101.csv: stiction or slack.\nThe valve sticks or has slack')
+    assert out.startswith('FIC101.csv: stiction or slack, probable: 3 of 100 sound valves')
+    assert '\nThe valve sticks or has slack: ' in out
+    assert '\nWhat to do: Put the controller in manual' in out
     assert 'loop.json' in out
 
 

@@ -50,7 +50,7 @@ def test_a_test_at_one_pressure_says_that_it_does_not_tell_the_form() -> None:
     frame = flow_test(3)
     frame['main_steam_pressure_mpa'] += np.linspace(0.0, 0.4, len(frame))
     found = vf.identify(frame)
-    (told,) = [n for n in found.characteristic.notes if 'F(V p^m)' in n]
+    (told,) = [n for n in found.characteristic.notes if 'at other pressures' in n]
     assert told.startswith('The pressure stayed between 16.70 and 17.10 MPa')
     assert told.replace("'", '&#x27;') in found.page().to_html()
 
@@ -108,6 +108,27 @@ def test_rows_that_follow_with_a_lag_are_no_static_test(seed: int) -> None:
 def test_what_is_no_static_test_is_refused(change) -> None:
     """A falling power, one opening, sliding pressure, no power, no relation."""
     with pytest.raises(DataError):
+        vf.identify(flow_test(1).assign(**change))
+
+
+def test_an_impossible_opening_is_no_row_of_a_static_test() -> None:
+    frame = flow_test(1)
+    frame.loc[len(frame) - 3 :, 'valve_opening_percent'] = (140.0, 150.0, 160.0)
+    found = vf.identify(frame).characteristic
+    assert found.source.steady == len(frame) - 3
+    assert found.breakpoints[-1] < 105.0 * frame['main_steam_pressure_mpa'].max() ** 1.125
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'valve_opening_percent': 50.0}, 'valve_opening is 50 % in all rows'),
+        ({'generated_power_mw': 200.0}, 'generated_power is 200 MW in all rows'),
+        ({'time': pd.Timestamp('2026-01-01', tz='UTC')}, 'Only one time, 2026-01-01 00:00:00 UTC'),
+    ],
+)
+def test_what_does_not_move_is_named(change, words) -> None:
+    with pytest.raises(DataError, match=words):
         vf.identify(flow_test(1).assign(**change))
 
 

@@ -83,6 +83,23 @@ def test_the_unit_stays_with_the_curve_and_another_one_is_refused(frame, log, us
                 call(wrong, curve)
 
 
+@pytest.mark.parametrize('pressure_mpa', [1.0, 4.0])
+def test_a_curve_at_one_pressure_is_told_over_the_opening(frame, pressure_mpa, tmp_path):
+    """A control valve with opening and flow only; the file keeps u."""
+    u = frame['valve_opening_percent'] * (frame['main_steam_pressure_mpa'] / 16.0) ** 1.125
+    table = frame.assign(valve_opening_percent=u, main_steam_pressure_mpa=pressure_mpa)
+    found = vf.identify(flow(table, 3.0))
+    over_u, over_opening = found.characteristic, found.data.shown
+    assert over_opening.breakpoints == pytest.approx(over_u.breakpoints / pressure_mpa**1.125)
+    assert over_opening.values() == pytest.approx(over_u.values())
+    v = np.linspace(*over_opening.breakpoints[[0, -1]], 9)[1:-1]
+    assert over_opening(v) == pytest.approx(over_u.power(v, pressure_mpa))
+    page = found.page().to_html()
+    for part in (' % opening: from ', 'valve opening (%)', ' per %)', 'in all rows: the curve'):
+        assert part in page, part
+    assert not re.search(r'% MPa<sup>|integrated input|\bu %|at every u\b|at each u\b', page)
+
+
 def test_a_unit_among_the_parameters_does_not_rename_what_the_log_holds(log):
     with pytest.raises(InputError, match='say what it is with --column'):
         vf.identify(log, parameters={'generated_power_unit': 't/h'})

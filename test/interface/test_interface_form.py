@@ -4,17 +4,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from functools import cache
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import valveflow_ros as vf
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.result import wrong_form
 from valveflow_ros.interface.models import load_model
+from valveflow_ros.plant.historian import Historian
+from valveflow_ros.plant.thermal_plant import simulate_thermal
+from valveflow_ros.plant.thermal_unit import ThermalUnit, random_unit
+from valveflow_ros.records import SIGNALS
+from valveflow_ros.report.answer import LoadGain, gain_by_load
 from valveflow_ros.report.validation import verdict_words
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING
 
@@ -50,6 +57,46 @@ def test_the_curve_is_right_over_opening_and_pressure_and_far_off_in_the_other_f
     assert 'is the wrong one' in held.page().to_html()
     assert 'is the wrong one' not in found.page().to_html()
     assert not any('mixture of before and after' in note for note in found.notes)
+
+
+@pytest.mark.parametrize(('kind', 'number'), [('choked', 1), ('integrated_input', 0)])
+def test_the_table_by_load_has_the_sliding_pressure_and_the_opening_that_gives_the_load(
+    kind, number
+):
+    unit = dataclasses.replace(random_unit(kind, number), reserve_hours=0.0)
+    rows = table_by_load(unit)
+    assert len(rows) > 6
+    v = np.linspace(20.0, 100.0, 8001)
+    for g in rows:
+        assert g.pressure == pytest.approx(unit.pressure_set_mpa(g.load), abs=0.4)
+        assert g.pressure_low < g.pressure < g.pressure_high
+        power = unit.static_power(v, np.full(v.size, g.pressure))
+        assert g.opening == pytest.approx(np.interp(g.load, power, v), abs=0.5)
+        assert g.low <= g.gain <= g.high
+    true = [
+        np.ptp(
+            unit.static_power(np.array([g.opening - 0.5, g.opening + 0.5]), np.full(2, g.pressure))
+        )
+        for g in rows
+    ]
+    assert np.median(np.abs([g.gain for g in rows] / np.array(true) - 1.0)) < 0.02
+
+
+def test_a_load_with_a_reserve_of_pressure_has_a_wide_range_in_the_table():
+    unit = dataclasses.replace(random_unit('choked', 1), reserve_hours=0.5)
+    rows = table_by_load(unit)
+    assert all(g.low <= g.gain <= g.high for g in rows)
+    raised = [g for g in rows if g.pressure_high - g.pressure_low > 2.0]
+    assert raised, 'two pressures at one load'
+    for g in raised:
+        assert g.pressure_low - 0.4 < unit.pressure_set_mpa(g.load) < g.pressure_high
+
+
+def table_by_load(unit: ThermalUnit) -> list[LoadGain]:
+    table = simulate_thermal(4.0, 1, unit, Historian('minute')).table
+    columns = {i.column: table.column(i.signal) for i in SIGNALS}
+    frame = pd.DataFrame(columns, index=pd.to_datetime(table.time_ns, utc=True))
+    return gain_by_load(vf.identify(frame).data)
 
 
 @pytest.mark.parametrize('kind', ['choked', 'integrated_input'])

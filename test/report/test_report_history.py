@@ -78,7 +78,8 @@ def test_the_story_is_told_in_two_sections_and_a_log_of_no_monitor_has_none():
     words = words_of(history())
     # The condition stood from hour 14 to hour 20.
     for part in (
-        '5 curves', '5 changes of 1 alarm and 1 diagnosis', 'Some alarm stood for 6 h in all.',
+        '5 curves', '5 changes of 1 alarm and 1 diagnosis',
+        'Some alarm was active for 6 h in all.',
         html.escape('6 MW less & it <lasts>'),
     ):  # fmt: skip
         assert part in words, part
@@ -170,7 +171,7 @@ def test_every_moment_has_one_state_for_each_alarm(changes):
         hours += bool({AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED} & set(states))
     days = f'{hours // 24} d' * (hours >= 24) + ' ' * (hours > 24 and hours % 24 > 0)
     days += f'{hours % 24} h' * (hours % 24 > 0)
-    said = f'Some alarm stood for {days} in all.' if hours else 'No alarm ever stood.'
+    said = f'Some alarm was active for {days} in all.' if hours else 'No alarm was ever active.'
     assert said in words_of(told)
 
 

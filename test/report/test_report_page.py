@@ -72,7 +72,9 @@ def test_the_answer_comes_first_with_its_numbers(report):
         'MW per 1 % of opening', 'A <note>.',
     ):  # fmt: skip
         assert part in words, part
-    assert re.search(rf'12\.0 \d+ {0.2 * 12.0**1.125:.2f} ', words), 'slope times pressure'
+    assert re.search(rf'12\.0 12\.0 to 12\.0 [\d.]+ {0.2 * 12.0**1.125:.2f} ', words), (
+        'slope times pressure'
+    )
     assert not re.search(r'\b(nan|None|inf)\b', words)
     for absent in ('Against the reference', 'How probable each number', 'rests on', 'not certain'):
         assert absent not in words
@@ -85,18 +87,21 @@ def test_gain_by_load_is_the_slope_of_the_power_over_the_opening(identified, for
     data = identified
     if form:
         v = data.table.column(Signal.VALVE_OPENING)
+        slope, intercept = np.polyfit(v, data.power / 12.0**1.1, 1).tolist()
         piece = replace(
             data.characteristic.pieces[0], u_from=float(v.min()) - 1.0,
-            u_to=float(v.max()) + 1.0, slope=0.2, slope_stderr=0.01,
+            u_to=float(v.max()) + 1.0, slope=slope, intercept=intercept, slope_stderr=0.01,
         )  # fmt: skip
         data = with_curve(data, **form, pieces=(piece,), partition_pieces=(piece,))
     rows = gain_by_load(data)
     assert rows
-    for _, p, v, gain, error, low, high in rows:
-        up, down = data.characteristic.power([v + 1e-4, v - 1e-4], [p, p])
-        assert gain == pytest.approx((up - down) / 2e-4, rel=1e-3)
+    for load, p, _, _, v, gain, error, low, high in rows:
+        assert data.characteristic.power(v, p) == pytest.approx(load)
+        power = data.characteristic.power(v + np.array([-1e-4, 0.0, 1e-4]), np.full(3, p))
+        sides = np.diff(power) / 1e-4  # they differ at a breakpoint
+        assert gain == pytest.approx(sides[np.argmin(np.abs(sides - gain))], rel=1e-3)
         assert error > 0.0
-        assert 0.0 < low <= high
+        assert 0.0 < low <= gain <= high
     values = data.table.values.copy()
     values[:, Signal.GENERATED_POWER] = 200.0
     assert gain_by_load(replace(data, table=replace(data.table, values=values))) == []

@@ -329,6 +329,26 @@ class Characteristic:
             pressure_scale_exponent=0.0, offset_mw=0.0, reference_pressure_mpa=p,
         )  # fmt: skip
 
+    def over_opening(self, pressure_mpa: float) -> Characteristic:
+        """Return the curve at one pressure over the opening in %: its exponent is 0."""
+        c = self.at_pressure(pressure_mpa)
+        per_percent = pressure_mpa**c.pressure_exponent
+
+        def there(piece: Piece) -> Piece:
+            return replace(
+                piece, u_from=piece.u_from / per_percent, u_to=piece.u_to / per_percent,
+                slope=piece.slope * per_percent, slope_stderr=piece.slope_stderr * per_percent,
+            )  # fmt: skip
+
+        return replace(
+            c, pieces=tuple(map(there, c.pieces)),
+            partition_pieces=tuple(map(there, c.partition_pieces)), pressure_exponent=0.0,
+            breakpoint_intervals=tuple(
+                (low / per_percent, high / per_percent) for low, high in c.breakpoint_intervals
+            ),
+            residuals=replace(c.residuals, input_noise=c.residuals.input_noise / per_percent),
+        )  # fmt: skip
+
     def __call__(
         self, u: FloatArray, pressure_mpa: FloatArray | float | None = None
     ) -> FloatArray:

@@ -57,7 +57,7 @@ from valveflow_ros.diagnosis.slow import (
     drift,
 )
 from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
-from valveflow_ros.errors import DataError, listed
+from valveflow_ros.errors import DataError, counted, listed
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
@@ -768,6 +768,16 @@ def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str,
 
 
 _THE_TIME = 'the time'
+# Variables of `structure` in words of a plant engineer; the others are such words already.
+_IN_WORDS = {
+    'u': 'opening and pressure (u)', 'pressure given u': 'the pressure at one u',
+    'ramp': 'how far the valve moved in the last 3 min',
+    'slow ramp': 'how far the valve moved in the last 15 min',
+    'pressure change': 'how far the pressure moved in the last 10 min',
+    'temperature change': 'how far the temperature moved in the last 20 min',
+    'valve travel': 'how much the valve moves to and fro',
+    'travel of the last hour': 'how much the valve moved in the last hour',
+}  # fmt: skip
 
 
 def _unexplained(rest: _Rest) -> tuple[str, ...]:
@@ -798,18 +808,22 @@ def _sentence(d: Diagnosis) -> str:
         told = (c.sentence + _nearly(c.not_told_apart) for c in d.causes)
         return ' '.join(told) + (wander if drifts else '')
     blind = [name for name, reason in d.rejected if 'cannot be judged' in reason]
-    but = f' These causes could not be checked with this record: {listed(blind)}.' if blind else ''
+    unseen = 'could not be checked with this record'
     if d.verdict == NOTHING:
         slow = '' if d.disturbance is None else 'a slow disturbance and '
+        but = f', {len(blind)} {unseen}' if blind else ''
         return (
-            f'No cause was found; {len(catalogue()) - len(blind)} were checked. The remaining '
-            f'difference between model and measurement is {slow}noise.{but}{wander}'
+            f'No cause was found: {len(catalogue()) - len(blind)} were checked{but}. The '
+            f'remaining difference between model and measurement is {slow}noise.{wander}'
         )
+    but = f' {counted(len(blind), "cause")} {unseen}.' if blind else ''
     near = f' Most similar: {", ".join(d.not_told_apart)}.' if d.not_told_apart else ''
     besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
     if d.unexplained_by == (_THE_TIME,):
         return f'{wander.strip()}{but}{besides}'
+    names = listed([_IN_WORDS.get(name, name) for name in d.unexplained_by])
     return (
-        'No cause of the catalogue explains the difference between model and measurement. It '
-        f'depends on {" and ".join(d.unexplained_by)}.{near}{but}' + wander + besides
+        f'Measured and simulated power differ by {d.rmse_extended:.2g} MW (root mean square). '
+        f'Part of this depends on {names}, and no cause of the catalogue explains it.'
+        f'{wander}{near}{but}{besides}'
     )

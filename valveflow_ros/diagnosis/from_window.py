@@ -29,6 +29,7 @@ from valveflow_ros.signals.static_form import StaticForm, pressure_of
 # An initial model if the special segments give none.
 
 _PIECES, _MOST = 4, 6
+_LEAST_ROWS = 1000
 _LEAST_SPREAD = 0.02
 
 
@@ -47,8 +48,11 @@ def first_model(
     )
     power = table.column(Signal.GENERATED_POWER)
     usable = np.isfinite(u) & np.isfinite(power)
-    if usable.sum() < 1000:
-        raise DataError('Too few rows have opening, pressure and power together.')
+    if usable.sum() < _LEAST_ROWS:
+        raise DataError(
+            f'{usable.sum()} rows have opening, pressure and power together; a diagnosis needs '
+            f'{_LEAST_ROWS} or more.'
+        )
     knots = np.quantile(u[usable], np.linspace(0.0, 1.0, _PIECES + 1))
     if knots[-1] - knots[0] < _LEAST_SPREAD * abs(knots[-1]):
         raise DataError('The valve hardly moves in this record: there is nothing to compare.')

@@ -21,6 +21,7 @@ BINS = 20
 _SHIFTS = 60
 _SEED = 11
 _NORMAL99 = 2.576
+_LEAST_RANGE = 1e-6  # in the unit of any variable
 _PLAY_PERCENT = 1.5
 _FAST_PERCENT, _FAST_S = 0.8, 10.0
 _BEFORE_S, _AFTER_S = 60.0, 300.0
@@ -64,8 +65,14 @@ def signatures(task: Task, before: Extended, after: Extended) -> tuple[Signature
     values = {n: v for n, v in variables(task, before).items() if n in UNITS}
     values['direction'] = _direction(task)
     return tuple(
-        _signature(name, values[name], old, new, good) for name in UNITS if name in values
-    )
+        _signature(name, values[name], old, new, good)
+        for name in UNITS if name in values and _varies(values[name][good])
+    )  # fmt: skip
+
+
+def _varies(values: FloatArray) -> bool:
+    """Return False for rounding errors about a constant, as of a constant given by the user."""
+    return float(np.ptp(values)) > _LEAST_RANGE
 
 
 def _direction(task: Task) -> FloatArray:
@@ -192,7 +199,7 @@ def residual_maps(task: Task, before: Extended, after: Extended) -> tuple[Residu
     old, good, _, _ = minutes(task, task.residual(before))
     new = minutes(task, task.residual(after))[0]
     values = variables(task, before)
-    return tuple(_map(a, u, values, old, new, good) for a, u in PAIRS)
+    return tuple(_map(a, u, values, old, new, good) for a, u in PAIRS if _varies(values[a][good]))
 
 
 def _map(

@@ -251,9 +251,10 @@ def shifted(likely: dict[int, float], by: int) -> dict[int, float]:
 
 def evidence_words(pieces: int, likely: dict[int, float]) -> str:
     """Return a sentence on the evidence for the number of pieces."""
+    each = 'no breakpoint' if pieces == 1 else 'each breakpoint'
     words = (
-        f'J = {pieces}: each breakpoint reduces the prediction error of all rows clearly (by at '
-        f'least {KNEE_GAIN:g} in log-likelihood)'
+        f'J = {pieces}: {each} reduces the prediction error of all rows clearly (by at least '
+        f'{KNEE_GAIN:g} in log-likelihood)'
     )
     if pieces in likely:
         percent = 100.0 * likely[pieces]

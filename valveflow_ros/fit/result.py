@@ -19,7 +19,7 @@ from valveflow_ros.curve.characteristic import (
     level_error_mw,
 )
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.errors import counted, short
+from valveflow_ros.errors import counted, listed, short
 from valveflow_ros.fit.piece_selection import evidence_words
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import Refined
@@ -255,6 +255,7 @@ NOT_REFINED = 'The curve is not refined: '  # beginning of a note on that
 _SMALL = 0.05  # half of a small 95 % interval, relative to the slope
 _MOST_PERCENT = 100.0  # an opening beyond it is no advice
 _LEAST_ROWS = 30  # minimum rows of a segment inside a piece to be counted
+_SAME_MW = 0.01  # a smaller difference of two forms is not given in numbers
 _APART = 10.0  # minimum difference of two distinct levels, in noise sd of u
 
 
@@ -275,12 +276,7 @@ def with_support(
         support_of(piece, contents, input_noise, last=k == len(c.pieces) - 1)
         for k, piece in enumerate(c.pieces)
     )
-    notes = [
-        _sentence(c, k + 1, piece, found)
-        for k, (piece, found) in enumerate(zip(c.at_pressure().pieces, support, strict=True))
-        if not found.identifiable
-    ]
-    return replace(c, support=support, notes=(*c.notes, *notes))
+    return replace(c, support=support, notes=(*c.notes, *_support_notes(c, support)))
 
 
 def wrong_form(c: Characteristic) -> str:
@@ -298,6 +294,8 @@ def wrong_form(c: Characteristic) -> str:
 def forms_apart(form: FormEvidence) -> str:
     """Return a phrase on how much the two forms differ, and where most."""
     opening, pressure, most = form.worst
+    if abs(most) < _SAME_MW:
+        return 'both give the same power at the pressures of these data'
     return (
         f'the two differ by {form.apart_mw:.2g} MW (root mean square), at {opening:.0f} % and '
         f'{pressure:.1f} MPa by {most:.2g} MW'
@@ -307,9 +305,7 @@ def forms_apart(form: FormEvidence) -> str:
 def weaknesses(c: Characteristic) -> tuple[str, ...]:
     """Return the doubts about a curve: its form, and the notes that report a weakness."""
     form = [wrong_form(c)] if wrong_form(c) else []
-    without = sum(1 for found in c.support if not found.identifiable)
-    unrefined = [n for n in c.notes[: len(c.notes) - without] if n.startswith(NOT_REFINED)]
-    return (*form, *unrefined, *c.notes[len(c.notes) - without :])
+    return (*form, *(n for n in c.notes if n.startswith((NOT_REFINED, 'Piece ', 'Pieces '))))
 
 
 def support_of(
@@ -357,29 +353,65 @@ def _distinct(levels: list[float], apart: float) -> list[float]:
     return found
 
 
-def _sentence(c: Characteristic, number: int, piece: Piece, found: Support) -> str:
-    """Return a sentence on the data of a piece, and on the data that it needs."""
-    name = f'Piece {number} ({c.place_words(piece.u_from, piece.u_to)})'
+def _support_notes(c: Characteristic, support: tuple[Support, ...]) -> list[str]:
+    """Return a sentence for each kind of piece without enough data of its own."""
+    groups: dict[tuple[str, bool], list[int]] = {}
+    pieces = c.at_pressure().pieces
+    for k, (piece, found) in enumerate(zip(pieces, support, strict=True)):
+        if not found.identifiable:
+            groups.setdefault((_rests(found), is_borrowed(piece)), []).append(k)
+    return [
+        _sentence(c, [(k + 1, pieces[k], support[k]) for k in group], rests, borrowed)
+        for (rests, borrowed), group in groups.items()
+    ]
+
+
+_AT_ENDS = 'no special segment of its own'
+
+
+def _rests(found: Support) -> str:
     if not found.samples:
-        rests = 'has no data in special segments'
-    elif not found.levels and not found.slope_response:
-        few = counted(found.samples, 'sample')
-        rests = f'has no special segment of its own, only {few} at the ends of others'
-    elif not found.levels:
-        rests = 'has data only in slope responses that hardly move'
-    else:
-        rests = 'has steady data at one load only'
-    places = _missing(piece, np.array(found.levels))
-    loads = ' and one at '.join(_operation(c, piece, u) for u in places)
-    if is_borrowed(piece):
+        return 'no data in special segments'
+    if not found.levels and not found.slope_response:
+        return _AT_ENDS
+    if not found.levels:
+        return 'data only in slope responses that hardly move'
+    return 'steady data at one load only'
+
+
+def _sentence(
+    c: Characteristic, weak: list[tuple[int, Piece, Support]], rests: str, borrowed: bool
+) -> str:
+    """Return a sentence on the data of pieces, and on the data that they need."""
+    many = len(weak) > 1
+    places = [(piece, u) for _, piece, found in weak for u in _missing(piece, found.levels)]
+    loads = [_operation(c, piece, u, short_of=many) for piece, u in places]
+    if many:
+        name = f'Pieces {listed([str(number) for number, _, _ in weak])} have '
+        name += rests.replace('its own', 'their own')
+        if borrowed:
+            return (
+                f'{name}: their slopes follow from the pieces beside them, and their errors hold '
+                'if each piece is straight. One hour of constant operation at each of about '
+                f'{listed(loads)} MW would check them.'
+            )
         return (
-            f'{name} {rests}: its slope follows from the pieces beside it, and its error holds if '
-            f'the piece is straight. One hour of constant operation at about {loads} would check '
-            'it.'
+            f'{name}, so their slopes are uncertain. One hour of constant operation at each of '
+            f'about {listed(loads)} MW would give them.'
+        )
+    ((number, piece, found),) = weak
+    if rests == _AT_ENDS:
+        rests += f', only {counted(found.samples, "sample")} at the ends of others'
+    name = f'Piece {number} ({c.place_words(piece.u_from, piece.u_to)}) has {rests}'
+    load = ' and one at '.join(loads)
+    if borrowed:
+        return (
+            f'{name}: its slope follows from the pieces beside it, and its error holds if the '
+            f'piece is straight. One hour of constant operation at about {load} would check it.'
         )
     return (
-        f'{name} {rests}, so its slope is uncertain. One hour of constant operation at about '
-        f'{loads} would give it.'
+        f'{name}, so its slope is uncertain. One hour of constant operation at about {load} would '
+        'give it.'
     )
 
 
@@ -391,9 +423,12 @@ def is_borrowed(piece: Piece) -> bool:
     return 0.0 < _Z95 * piece.slope_stderr < _SMALL * abs(piece.slope)
 
 
-def _operation(c: Characteristic, piece: Piece, u: float) -> str:
-    """Return the operation at a u on a piece, at the usual pressure, in words."""
-    power, pressure = f'{short(piece.slope * u + piece.intercept)} MW', c.reference_pressure_mpa
+def _operation(c: Characteristic, piece: Piece, u: float, short_of: bool) -> str:
+    """Return the operation at a u on a piece, at the usual pressure; in MW only, if short."""
+    load = short(piece.slope * u + piece.intercept)
+    if short_of:
+        return load
+    power, pressure = f'{load} MW', c.reference_pressure_mpa
     if not math.isfinite(pressure):
         return power
     opening = u / pressure**c.pressure_exponent
@@ -402,10 +437,10 @@ def _operation(c: Characteristic, piece: Piece, u: float) -> str:
     return f'{opening:.0f} % opening ({power} at {pressure:.1f} MPa)'
 
 
-def _missing(piece: Piece, levels: FloatArray) -> list[float]:
+def _missing(piece: Piece, levels: tuple[float, ...]) -> list[float]:
     """Return where steady states are missing: two points, or the one farther from a level."""
     width = piece.u_to - piece.u_from
     places = [piece.u_from + share * width for share in (0.2, 0.8)]
-    if not len(levels):
+    if not levels:
         return places
-    return [max(places, key=lambda u: abs(u - float(levels[0])))]
+    return [max(places, key=lambda u: abs(u - levels[0]))]

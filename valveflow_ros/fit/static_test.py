@@ -104,6 +104,11 @@ def find_static_test(table: SampleTable, settings: Settings) -> StaticTest | Non
     return StaticTest(_characteristic(table, u, rows, line, rest, settings), segments)
 
 
+def may_be_static_test(table: SampleTable, settings: Settings) -> bool:
+    """Return True for a table with rows as far apart and as few as those of a static test."""
+    return settings.real('sample_period') >= COARSE_STEP_S and len(table) <= _MOST_ROWS
+
+
 def _rows(opening: FloatArray, pressure: FloatArray, power: FloatArray) -> IntArray:
     """Return the indices of rows with all values, without repetitions of the previous row."""
     values = np.column_stack([opening, pressure, power])
@@ -211,8 +216,8 @@ def _characteristic(
     gaps = zip(line.knots[1:-1].tolist(), line.knot_error.tolist(), strict=True)
     note = (
         f'The table was taken as a static test: {len(rows)} steady rows, '
-        f'{counted(step_s, "s", "s")} apart or more, at {float(pressure.mean()):.2f} MPa. Steady '
-        'rows tell no time constant and no delay.'
+        f'{counted(step_s, "s", "s")} apart or more. Steady rows show no time constant and no '
+        'delay.'
     )
     return Characteristic(
         pressure_exponent=settings.real('pressure_exponent'),

@@ -333,10 +333,11 @@ def _pressure_spread(pressure: FloatArray) -> float:
 
 def form_note(pressure: FloatArray) -> str:
     """Return a note that a test at one pressure does not determine the form of the power."""
+    low, high = f'{pressure.min():.2f}', f'{pressure.max():.2f}'
+    stayed = f'was {low} MPa' if low == high else f'stayed between {low} and {high} MPa'
     return (
-        f'The pressure stayed between {pressure.min():.2f} and {pressure.max():.2f} MPa: whether '
-        'the power follows F(V p^m), as this curve does, or p^m F(V) + c cannot be decided '
-        'from that. At other pressures the curve may be wrong.'
+        f'The pressure {stayed}. Such data do not show how the power depends on the pressure: at '
+        'other pressures the curve may be wrong.'
     )
 
 

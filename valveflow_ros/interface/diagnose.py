@@ -18,7 +18,7 @@ from valveflow_ros.diagnosis.corrector import covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.from_window import first_model, on_top
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
-from valveflow_ros.diagnosis.result import Diagnosis, model_to_json, to_json
+from valveflow_ros.diagnosis.result import NAMED, Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
 from valveflow_ros.errors import DataError, InputError
 from valveflow_ros.interface import SILENT, Progress
@@ -35,7 +35,7 @@ from valveflow_ros.interface.observation import (
     taken_covariates,
 )
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import SIGNALS, IntArray, SampleTable
+from valveflow_ros.records import SIGNALS, IntArray, SampleTable, Signal
 from valveflow_ros.report.diagnosis import Diagnosed, diagnosis_page
 from valveflow_ros.report.page import Page
 from valveflow_ros.report.words import held_words
@@ -190,7 +190,6 @@ def diagnose(
     )
     if rows.why:
         progress.warn(rows.why)
-        notes.append(rows.why)
     step, settle = settings.real('sample_period'), settings.settle_s
     form, regional = rows.form, rows.model
     if model is not None:
@@ -230,14 +229,25 @@ def diagnose(
     if followed := [c.name for c in beside if c.name in {n.name for n in found.causes}]:
         notes.append(_TAKE_IT_OUT.format(' and '.join(followed)))
     signatures, answers, maps = views(record, found)
+    if rows.why and found.verdict == NAMED:
+        notes.append(rows.why)
+    elif rows.why:  # more important than that no cause was found
+        found = replace(found, sentence=f'{rows.why} {found.sentence}')
     found = replace(found, notes=(*log.contents.warnings, *kept, *notes, *found.notes))
     found = found.measured_in(settings.output_unit)
     times = rows.table.time_ns
     data = Diagnosed(
         log.name, int(times[0]), int(times[-1]), found, signatures, answers, maps,
-        recorded_history(log.contents), form.input_exponent, settings.output_unit,
+        recorded_history(log.contents), _exponent_shown(rows.table, form), settings.output_unit,
     )  # fmt: skip
     return DiagnosisResult(data, form, earlier)
+
+
+def _exponent_shown(table: SampleTable, form: StaticForm) -> float:
+    """Return the exponent of u; 0 if u is the opening because the pressure is always 1 MPa."""
+    pressure = table.column(Signal.MAIN_STEAM_PRESSURE)
+    is_one = bool(np.all(pressure[np.isfinite(pressure)] == 1.0))
+    return 0.0 if is_one else form.input_exponent
 
 
 def _covariate_rows(

@@ -22,7 +22,7 @@ from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import DataError, UsageError, listed
 from valveflow_ros.fit.model_form import find_misfit
 from valveflow_ros.fit.result import EXPONENT_NOTES
-from valveflow_ros.fit.static_test import find_static_test
+from valveflow_ros.fit.static_test import find_static_test, may_be_static_test
 from valveflow_ros.fit.step_levels import looks_like_step_test
 from valveflow_ros.fit.step_test import identify_step_test
 from valveflow_ros.interface import SILENT, Progress
@@ -31,6 +31,7 @@ from valveflow_ros.interface.logs import Log, as_log
 from valveflow_ros.interface.models import check_output, load_extended, taken_curve, taken_model
 from valveflow_ros.interface.monitor import recorded_history
 from valveflow_ros.interface.observation import check_signals, observe_log, settings_of
+from valveflow_ros.parameters import Settings
 from valveflow_ros.records import (
     N_SIGNALS,
     SIGNALS,
@@ -46,7 +47,7 @@ from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
 from valveflow_ros.report.words import period
-from valveflow_ros.signals.align import align_whole
+from valveflow_ros.signals.align import align_whole, plausible_ranges
 from valveflow_ros.signals.units import in_unit
 
 CURVE = 'characteristic.json'
@@ -54,6 +55,12 @@ STEP_TEST_ADVICE = (
     'This looks like a manual step test (few openings, each held). If the load controller was in '
     'manual, --step-test identifies it from its steady states; for data of a closed loop do not '
     'use it.'
+)
+
+
+STATIC_ADVICE = (
+    'A static test needs fewer rows, at least 12: steady rows at one pressure and several '
+    'openings, on a rising curve.'
 )
 
 
@@ -211,7 +218,7 @@ def _identified(
         characteristic = _of_compressed(observed.fit(progress), log)
     except DataError as error:
         table, _, counts = align_whole(log.readings, settings)
-        read = _rows_as_read(log.readings)
+        read = _rows_as_read(log.readings, settings)
         test = None if model is not None else find_static_test(read, settings)
         if test is not None:
             for sentence in test.characteristic.notes:
@@ -219,10 +226,13 @@ def _identified(
             return Identified(
                 source=log.name, characteristic=test.characteristic, table=read,
                 segments=test.segments, counts=counts, settings=settings,
-                notes=(*log.notes, *notes),
+                notes=(*log.notes, *notes), one_pressure=_one_pressure(log),
             )  # fmt: skip
         if looks_like_step_test(table, settings):
             raise DataError(f'{error} {STEP_TEST_ADVICE}') from None
+        few = 'learn the noise' in str(error)
+        if few and model is None and may_be_static_test(read, settings):
+            raise DataError(f'{error} {STATIC_ADVICE}') from None
         raise
     told = []
     if observed.clock_resets:
@@ -240,7 +250,7 @@ def _identified(
         source=log.name, characteristic=characteristic, table=observed.table,
         segments=observed.segments, counts=observed.counts, settings=settings,
         notes=(*log.notes, *notes, *told), mixture=mixture,
-        history=recorded_history(log.contents),
+        history=recorded_history(log.contents), one_pressure=_one_pressure(log),
     )  # fmt: skip
     misfit = find_misfit(
         *_inputs(found.table), found.power - found.static_mw, found.power, found.rows,
@@ -277,16 +287,27 @@ def _of_compressed(c: Characteristic, log: Log) -> Characteristic:
     return replace(c, notes=(*(n for n in c.notes if n not in said), hidden))
 
 
+def _one_pressure(log: Log) -> bool:
+    """Return True if the pressure is one value throughout, as a constant given by the user."""
+    r = log.readings
+    pressure = r.value[(r.signal == Signal.MAIN_STEAM_PRESSURE) & np.isfinite(r.value)]
+    return bool(len(pressure)) and float(np.ptp(pressure)) == 0.0
+
+
 def _inputs(table: SampleTable) -> tuple[FloatArray, FloatArray]:
     """Return opening and pressure."""
     return table.column(Signal.VALVE_OPENING), table.column(Signal.MAIN_STEAM_PRESSURE)
 
 
-def _rows_as_read(readings: Readings) -> SampleTable:
-    """Return a row for each time with any reading; values are neither held nor shifted."""
+def _rows_as_read(readings: Readings, settings: Settings) -> SampleTable:
+    """Return a row for each time with any reading; values are neither held nor shifted.
+
+    Impossible values are left out, as in any other row.
+    """
     times, row = np.unique(readings.time_ns, return_inverse=True)
     values = np.full((N_SIGNALS, len(times)), np.nan)
-    good = readings.quality < Quality.BAD
+    low, high = plausible_ranges(settings)[readings.signal].T
+    good = (readings.quality < Quality.BAD) & (readings.value >= low) & (readings.value <= high)
     values[readings.signal[good], row[good]] = readings.value[good]
     return SampleTable.from_columns(times, {info.signal: values[info.signal] for info in SIGNALS})
 
@@ -304,4 +325,5 @@ def _step_test(log: Log, given: Mapping[str, Any], progress: Progress) -> Identi
     return Identified(
         source=log.name, characteristic=test.characteristic, table=table,
         segments=test.segments, counts=counts, settings=settings, notes=(*log.notes, *notes),
+        one_pressure=_one_pressure(log),
     )  # fmt: skip

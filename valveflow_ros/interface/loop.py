@@ -26,6 +26,36 @@ FILE = 'loop.json'
 _MOST_GRID = 4
 
 
+# The verdict and how sure it is, without and with a measured position; the counts are rounded
+# from the study of simulated loops in docs/method.md.
+_HEADLINES = {
+    'stiction': (
+        'stiction or slack, probable: 3 of 100 sound valves in simulated loops are called so',
+        'stiction, measured',
+    ),
+    'backlash': ('slack, probable', 'slack, measured'),
+    'healthy': (
+        'no fault found, not certain: 4 of 10 faults in simulated loops are not seen',
+        'no fault found, by the measured position',
+    ),
+    'oscillating': ('the loop oscillates, and no fault of the valve is found',) * 2,
+    'not_judged': ('not judged: this record cannot tell',) * 2,
+}
+_TO_DO = {
+    'stiction': (
+        'Put the controller in manual and make small steps in both directions: with a sound valve '
+        'the process value follows each of them.',
+        'Have packing, positioner and air supply of the valve checked.',
+    ),
+    'backlash': ('', 'Have the linkage between actuator, stem and position feedback checked.'),
+    'oscillating': (
+        'Put the controller in manual. If the swing goes on, look for its source outside this '
+        'loop; if it stops, tune the controller.',
+    )
+    * 2,
+}
+
+
 @dataclass(frozen=True, slots=True)
 class LoopResult:
     """The result for the valve of a control loop.
@@ -46,6 +76,16 @@ class LoopResult:
     names: dict[str, str]
     time_s: FloatArray
     columns: dict[str, FloatArray]
+
+    @property
+    def headline(self) -> str:
+        """Return the verdict and how sure it is, in words without a full stop."""
+        return _HEADLINES[self.judgement.verdict][POSITION in self.names]
+
+    @property
+    def to_do(self) -> str:
+        """Return what to do next; empty if the reason says it, or nothing need be done."""
+        return _TO_DO.get(self.judgement.verdict, ('', ''))[POSITION in self.names]
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of ``loop.json``."""

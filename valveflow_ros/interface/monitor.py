@@ -248,7 +248,7 @@ class MonitorResult(Result):
         ]
         if not parts:
             gone = f' {counted(len(alarms), "alarm")} came and went.' if alarms else ''
-            known = 'No alarm stands at the end.' if curves else 'No new curve was found.'
+            known = 'No alarm is active at the end.' if curves else 'No new curve was found.'
             parts.append(html.paragraph(known + gone, '' if gone or not curves else 'good'))
         if not self.diagnoses:
             return parts

@@ -42,11 +42,12 @@ from valveflow_ros.records import (
     IntArray,
     Readings,
     SampleTable,
+    Signal,
     SpecialSegment,
 )
 from valveflow_ros.report.data import REASON_WORDS
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
-from valveflow_ros.report.words import duration
+from valveflow_ros.report.words import duration, moment
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
 from valveflow_ros.signals.align import Aligned, Aligner, aligned_blocks
 from valveflow_ros.signals.covariates import entry, held
@@ -253,9 +254,11 @@ def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None
             continue
         refused = {r: n for r, n in counts[info.topic].items() if n and r != 'accepted'}
         if not refused:
+            steam = info.signal == Signal.MAIN_STEAM_PRESSURE
+            constant = f', or give --constant {info.topic}=VALUE if it hardly changes'
             raise DataError(
-                f'The log has no {info.topic}; name yours with --column {info.topic}=THEIRS, '
-                f'or give --constant {info.topic}=VALUE if it hardly changes.'
+                f'The log has no {info.topic}; name yours with --column {info.topic}=THEIRS'
+                f'{constant if steam else ""}.'
             )
         told = ', '.join(f'{REASON_WORDS.get(r, r)} ({n} times)' for r, n in refused.items())
         raise DataError(
@@ -266,11 +269,25 @@ def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None
 def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
     needed = [info.signal for info in _NEEDED]
     good = np.isfinite(table.values[:, needed]).all(axis=1)
+    if good.sum() == 1:
+        return (
+            f'Only one time, {moment(int(table.time_ns[good][0]))}, has opening, pressure and '
+            'power: is it the right column of times?'
+        )
+    step_s = settings.real('sample_period')
+    coarse = step_s >= COARSE_STEP_S
+    for signal in (Signal.VALVE_OPENING, Signal.GENERATED_POWER):
+        values = table.column(signal)[good]
+        # Of a short log the length is to be told.
+        if (learnt or coarse) and len(values) and np.ptp(values) == 0.0:
+            return (
+                f'{SIGNALS[signal].topic} is {values[0]:g} {SIGNALS[signal].unit} in all rows: a '
+                'curve needs several openings and the power at each.'
+            )
     usable, longest = int(good.sum()), _longest_run(table.time_ns[good], settings)
-    span = duration(usable * settings.real('sample_period'))
+    span = duration(usable * step_s)
     if not learnt:
-        stretch_s, step_s = WINDOW * settings.real('block'), settings.real('sample_period')
-        coarse = step_s >= COARSE_STEP_S
+        stretch_s = WINDOW * settings.real('block')
         have = (
             f'{counted(usable, "usable row")}, one every {duration(step_s)}'
             if coarse
@@ -281,17 +298,11 @@ def _no_segment(table: SampleTable, settings: Settings, learnt: bool) -> str:
             have += f', at most {most} without a gap'
         each = f'{math.ceil(stretch_s / step_s)} rows ' if coarse else ''
         each += f'({duration(stretch_s)})' if coarse else duration(stretch_s)
-        told = (
+        return (
             f'The log holds {have}. To learn the noise of the signals it takes {WARM_UP} '
             f'stretches of {each} without a gap, and special segments after that to find the '
             'curve.'
         )
-        if coarse:
-            told += (
-                ' Fewer rows, 12 at least, are enough for a static test: steady rows at one '
-                'pressure and several openings.'
-            )
-        return told
     least = settings.settle_s + min(settings.real('steady_min'), settings.real('slope_min'))
     return (
         f'No steady-state or slope-response segment was found in {span} of data: the valve must '

@@ -168,8 +168,10 @@ def refuse_impossible(path: object, doubts: Iterable[Doubt], names: dict[Signal,
         if not found.looks_like:
             said = (
                 f'{said.removesuffix(".")}; name the right column with --column '
-                f'{topic}={THEIRS}[:unit], or give --constant {topic}=VALUE'
+                f'{topic}={THEIRS}[:unit]'
             )
+            if found.signal in (Signal.MAIN_STEAM_PRESSURE, Signal.MAIN_STEAM_TEMPERATURE):
+                said += f', or give --constant {topic}=VALUE'
         problems.append(f"'{theirs}' is taken for {said}")
         remedies.append(found.remedy(theirs))
     if problems:

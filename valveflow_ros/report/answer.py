@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ import numpy as np
 from valveflow_ros.curve.characteristic import Characteristic, Choice, RegionDynamics, piece_of
 from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.fit.result import forms_apart, is_borrowed, wrong_form
+from valveflow_ros.fit.static_test import STATIC_RULE
+from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.records import FloatArray, Signal
 from valveflow_ros.report import figure as plot
 from valveflow_ros.report import page as html
@@ -19,7 +22,7 @@ from valveflow_ros.report import words as say
 from valveflow_ros.report.figure import Figure, Spec
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.words import NOT_KNOWN, Z95
-from valveflow_ros.signals.static_form import OPENING
+from valveflow_ros.signals.static_form import LEAST_PRESSURE_RANGE, OPENING, pressure_range
 
 # Below this explained fraction of the power, it depends on something else, or a signal is wrong.
 _LITTLE = 0.8
@@ -60,13 +63,14 @@ def doubt(data: Identified) -> str:
 
 
 def _no_effect(data: Identified) -> str:
-    gains = gain_by_load(data)
-    if not gains:
+    there = [(load, float(np.median(v)), float(np.median(p))) for load, v, p in _at_loads(data)]
+    if not there:
         return ''
+    loads, openings, pressures = np.array(there).T
     opening = data.table.column(Signal.VALVE_OPENING)
     reach = float(np.ptp(np.nanquantile(opening, (0.01, 0.99))))
-    effect, loads = max(abs(g.gain) for g in gains) * reach, gains[-1].load - gains[0].load
-    if effect > _NO_EFFECT * loads:
+    effect = float(np.abs(_gains(data.characteristic, openings, pressures)[0]).max()) * reach
+    if effect > _NO_EFFECT * float(np.ptp(loads)):
         return ''
     return (
         'Do not rely on this curve: the power follows the pressure alone, and the whole range of '
@@ -85,9 +89,11 @@ def misfit_words(misfit: Misfit) -> str:
     )
 
 
-def form_words(c: Characteristic) -> str:
+def form_words(data: Identified) -> str:
     """Return the form of the power and its evidence; empty for the paper's form if confirmed."""
-    form = c.form
+    c, form = data.characteristic, data.characteristic.form
+    if data.one_pressure and c.choice.rule not in (RULE, STATIC_RULE):  # they have a note
+        return 'The pressure is the same in all rows: the curve holds at that pressure only.'
     if form is None or form.contradicted:
         return ''
     mine = c.static_form.words
@@ -109,86 +115,109 @@ def form_words(c: Characteristic) -> str:
 _LOADS = 50.0, 20.0, 10.0, 5.0  # steps of the table by load, MW
 _NEAR = 0.02  # of the range of the power: rows at a load
 _LEAST_ROWS = 20
+_PRESSURES = 41  # between the ends of the pressures at a load
 
 
 class LoadGain(NamedTuple):
-    """The effect of the opening at a load."""
+    """The effect of the opening at a load, over the pressures that the unit had there.
+
+    A unit that slides and at times holds a reserve has two usual pressures at one load: their
+    median may be either, or lie between them. So the ends tell more than the middle.
+    """
 
     load: float  # MW
-    pressure: float  # median of the rows near it, MPa
-    opening: float  # %
+    pressure: float  # median of the rows at the load, MPa
+    pressure_low: float  # ends of nine of ten of these rows
+    pressure_high: float
+    opening: float  # that gives the load at the median pressure, %
     gain: float  # there, MW per % of opening
     error: float  # its 95 % error
-    low: float  # its range over nine of ten of these rows, whose pressures and openings differ
+    low: float  # its range over these pressures
     high: float
 
 
-def gain_by_load(data: Identified) -> list[LoadGain]:
-    """Return the effect of the opening at each load, from all rows."""
-    c = data.characteristic
+def _at_loads(data: Identified) -> Iterator[tuple[float, FloatArray, FloatArray]]:
+    """Yield round loads with the openings and pressures of the rows near each."""
     wanted = [Signal.GENERATED_POWER, Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]
     rows = data.table.values[:, wanted]
     power, opening, pressure = rows[np.isfinite(rows).all(axis=1)].T
-    if not len(power):
-        return []
-    slopes = np.array([piece.slope for piece in c.pieces])
-    per_percent = pressure ** (c.pressure_exponent + c.pressure_scale_exponent)
-    gains = slopes[piece_of(c, opening * pressure**c.pressure_exponent)] * per_percent
-    low, high = np.quantile(power, (0.01, 0.99)).tolist()
+    low, high = np.quantile(power, (0.01, 0.99)).tolist() if len(power) else (0.0, 0.0)
     if not high > low:
-        return []
+        return
     step = next((s for s in _LOADS if high - low > 4.0 * s), (high - low) / 4.0)
-    found = []
-    for load in np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step:
+    for load in (np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step).tolist():
         near = np.abs(power - load) < _NEAR * (high - low)
-        if near.sum() < _LEAST_ROWS:
-            continue
-        p, v = float(np.median(pressure[near])), float(np.median(opening[near]))
-        piece = c.pieces[int(piece_of(c, np.array([v * p**c.pressure_exponent]))[0])]
-        scale = p ** (c.pressure_exponent + c.pressure_scale_exponent)
-        least, most = np.quantile(gains[near], (0.05, 0.95)).tolist()
-        found.append(LoadGain(
-            float(load), p, v, piece.slope * scale, Z95 * piece.slope_stderr * scale, least, most,
-        ))  # fmt: skip
+        if near.sum() >= _LEAST_ROWS:
+            yield load, opening[near], pressure[near]
+
+
+def _gains(
+    c: Characteristic, opening: FloatArray, pressure: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return MW per % of opening and its standard error."""
+    scale = pressure ** (c.pressure_exponent + c.pressure_scale_exponent)
+    piece = piece_of(c, opening * pressure**c.pressure_exponent)
+    slopes = np.array([(p.slope, p.slope_stderr) for p in c.pieces])
+    return scale * slopes[piece, 0], scale * slopes[piece, 1]
+
+
+def gain_by_load(data: Identified) -> list[LoadGain]:
+    """Return the effect of the opening at each load that the curve reaches."""
+    c, found = data.characteristic, []
+    for load, _, pressures in _at_loads(data):
+        low, middle, high = np.quantile(pressures, (0.05, 0.5, 0.95)).tolist()
+        p = np.append(np.linspace(low, high, _PRESSURES), middle)
+        v = c.opening(load, p)
+        gains, errors = _gains(c, v, p)
+        known = gains[np.isfinite(v)]
+        if math.isfinite(v[-1]):
+            found.append(LoadGain(
+                load, middle, low, high, float(v[-1]), float(gains[-1]),
+                Z95 * float(errors[-1]), float(known.min()), float(known.max()),
+            ))  # fmt: skip
     return found
 
 
 def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of MW per % of opening by load."""
     unit = data.characteristic.output_unit
-    head = [f'load ({unit})', 'usual pressure (MPa)', 'opening (%)',
-            f'{unit} per 1 % of opening', '95 % interval', 'range at this load']  # fmt: skip
+    head = [f'load ({unit})', 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
+            f'{unit} per 1 % of opening', '95 % interval', 'over that range']  # fmt: skip
     cells = [
         [
             say.decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1), say.decimals(g.pressure, 1),
-            say.decimals(g.opening, 0), say.plain(g.gain, 3),
+            f'{say.decimals(g.pressure_low, 1)} to {say.decimals(g.pressure_high, 1)}',
+            say.decimals(g.opening, 1), say.plain(g.gain, 3),
             f'{say.plain(g.gain - g.error, 3)} to {say.plain(g.gain + g.error, 3)}'
             if g.error > 0.0 else '-',
             f'{say.plain(g.low, 3)} to {say.plain(g.high, 3)}',
         ]
         for g in gain_by_load(data)
     ]  # fmt: skip
+    if data.one_pressure:  # then there is no range of pressures
+        head, *cells = ([row[0], *row[3:6]] for row in (head, *cells))
     return head, cells
 
 
 def gain_table(data: Identified) -> str:
     """Return the table of MW per % of opening by load; empty without data for it."""
     head, cells = gain_cells(data)
-    caption = (
-        'MW per 1 % of opening at each load, at the pressure that is usual at this load. The '
-        'range is that of nine tenths of the time at this load, with other pressures and openings.'
-    )
+    caption = 'MW per 1 % of opening at each load.'
+    if not data.one_pressure:
+        caption += (
+            ' The opening is the one that gives the load at the median pressure. The usual range '
+            'of the pressure holds for nine tenths of the time at this load; it is wide if the '
+            'unit at times keeps a higher pressure.'
+        )
     return html.table(head, cells, caption=caption) if cells else ''
 
 
 def answer_words(data: Identified) -> str:
     """Return a summary paragraph for an engineer, with the risks of the result."""
     c = data.shown
-    ends, values, m = c.breakpoints, c.values(), c.pressure_exponent
     words = (
-        f'The flow characteristic has <b>{say.counted(len(c.pieces), "piece")}</b> and is known '
-        f'from {say.span(values[0], values[-1])} MW{data.at_pressure} ({say.input_name(m)} from '
-        f'{say.span(ends[0], ends[-1])} {say.input_unit(m)}).{_bends(c)} It explains '
+        f'The flow characteristic has <b>{say.counted(len(c.pieces), "piece")}</b>. '
+        f'{range_words(data)}{_bends(c)} It explains '
         f'{say.percent(explained(data))} of the variance of the power in '
         f'{say.counted(c.source.steady, "steady-state segment")} and '
         f'{say.counted(c.source.slope_response, "slope-response segment")} '
@@ -206,15 +235,35 @@ def answer_words(data: Identified) -> str:
         )
     if any(p.slope <= 0.0 for p in c.pieces):
         told.append(
-            'On one piece the power does not rise with u, so the curve has no inverse there and '
-            'cannot be compensated. A flat upper end is normal; a falling piece elsewhere is not.'
+            'On one piece the power does not rise with '
+            f'{say.input_name(c.pressure_exponent)}, so the curve has no inverse there and cannot '
+            'be compensated. A flat upper end is normal; a falling piece elsewhere is not.'
         )
     told += [html.text(n) for n in (say.held_words(c.held), *c.notes)]
-    form = form_words(data.characteristic)
+    form = form_words(data)
     doubts = doubt(data)
     said = html.notice(html.text(doubts)) if doubts else ''
     said += html.paragraph(words, 'answer') + (html.paragraph(html.text(form)) if form else '')
     return said + ''.join(html.notice(n) for n in told if n)
+
+
+def range_words(data: Identified) -> str:
+    """Return the ends of the curve in a sentence: openings if the pressure was nearly constant."""
+    c, unit = data.shown, data.characteristic.output_unit
+    ends, m = c.breakpoints[[0, -1]], c.pressure_exponent
+    power = f'{say.span(*c.values()[[0, -1]])} {unit}'
+    pressure = data.table.column(Signal.MAIN_STEAM_PRESSURE)[data.special]
+    over_u = '' if m == 0.0 else f'u from {say.span(*ends)} {say.input_unit_plain(m)}'
+    if m == 0.0:
+        opening, at = ends, '' if data.one_pressure else data.at_pressure
+    elif len(pressure) and pressure_range(pressure) < LEAST_PRESSURE_RANGE:
+        usual = float(np.median(pressure))
+        opening, at = ends / usual**m, f' at {usual:.3g} MPa'
+    else:
+        return f'The curve is known from {power} ({over_u}).'
+    known = f'The curve is known from {say.decimals(float(opening[0]), 1)} % to '
+    known += f'{say.decimals(float(opening[1]), 1)} % opening{at}: from {power}'
+    return f'{known} ({over_u}).' if over_u else f'{known}.'
 
 
 def _bends(c: Characteristic) -> str:

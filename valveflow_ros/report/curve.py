@@ -58,14 +58,17 @@ def _unrefined(data: Identified) -> bool:
 def curve_figure(data: Identified) -> Figure:
     """Return the figure of the characteristic."""
     c = data.shown
-    u = data.u[data.special]
-    traces = [_heat(u, data.power_shown[data.special]), *_bands(data, u)]
+    name, u = say.input_name(c.pressure_exponent), data.u[data.special]
+    hover = f'{name} %{{x:.4~g}}<br>%{{y:.4~g}} MW'
+    traces = [_heat(u, data.power_shown[data.special], hover), *_bands(data, u)]
     if _unrefined(data):
-        traces.append(_line(c.partition_pieces, 'before refining', 'raw', 1.2, 'dash', ''))
+        traces.append(_line(c.partition_pieces, 'before refining', 'raw', 1.2, 'dash'))
     if data.reference is not None:
         there = data.reference.at_pressure(c.reference_pressure_mpa)
-        traces.append(_line(there.pieces, 'reference', 'chosen', 2, 'dot'))
-    traces.append(_line(c.pieces, 'flow characteristic', 'curve', 2.6))
+        if data.one_pressure:
+            there = data.reference.over_opening(data.median_pressure)
+        traces.append(_line(there.pieces, 'reference', 'chosen', 2, 'dot', hover))
+    traces.append(_line(c.pieces, 'flow characteristic', 'curve', 2.6, hover=hover))
     if len(c.pieces) > 1:
         traces.append(_breakpoints(data))
     layout: Spec = {
@@ -81,8 +84,8 @@ def curve_figure(data: Identified) -> Figure:
         }]  # fmt: skip
     ends, values = c.breakpoints, c.values()
     words = (
-        f'Flow characteristic of {say.counted(len(c.pieces), "piece")} from u '
-        f'{say.plain(float(ends[0]))} ({say.plain(float(values[0]))} MW) to u '
+        f'Flow characteristic of {say.counted(len(c.pieces), "piece")} from {name} '
+        f'{say.plain(float(ends[0]))} ({say.plain(float(values[0]))} MW) to {name} '
         f'{say.plain(float(ends[-1]))} ({say.plain(float(values[-1]))} MW), over the density of '
         'special samples.'
     )
@@ -90,11 +93,14 @@ def curve_figure(data: Identified) -> Figure:
 
 
 def opening_figure(data: Identified) -> Figure | None:
-    """Return the power over the opening at typical pressures; None if the pressure is unknown."""
+    """Return the power over the opening at typical pressures.
+
+    None if the pressure is unknown, or if the curve is already over the opening.
+    """
     wanted = [Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]
     opening, pressure = data.table.values[data.special][:, wanted].T
     known = np.isfinite(opening) & (pressure > 0.0)
-    if not known.any():
+    if not known.any() or data.one_pressure:
         return None
     low, middle, high = np.quantile(pressure[known], (0.05, 0.5, 0.95)).tolist()
     wide = high - low > _SAME_PRESSURE * middle
@@ -193,7 +199,7 @@ def _round_levels(power: FloatArray) -> list[float]:
 
 
 def _caption(data: Identified) -> str:
-    c = data.characteristic
+    c, name = data.shown, say.input_name(data.shown.pressure_exponent)
     parts = [
         '<b>The curve should run through the middle of the samples.</b> Colour: density of the '
         'samples in special segments.'
@@ -216,7 +222,7 @@ def _caption(data: Identified) -> str:
         parts.append('The dotted <span class="key reference">line</span> is the reference.')
     if (day := last_range(data)) is not None:
         parts.append(
-            f'The tinted background is where the unit ran in the last day, u {day[0]:.0f} to '
+            f'The tinted background is where the unit ran in the last day, {name} {day[0]:.0f} to '
             f'{day[1]:.0f}.'
         )
     if _unrefined(data):
@@ -230,7 +236,7 @@ def _caption(data: Identified) -> str:
 
 def _line(
     pieces: tuple[Piece, ...], name: str, colour: str, width: float, dash: str = '',
-    hover: str = 'u %{x:.4~g}<br>%{y:.4~g} MW',
+    hover: str = '',
 ) -> Spec:  # fmt: skip
     x = [v for p in pieces for v in (p.u_from, p.u_to, math.nan)]
     y = [
@@ -272,7 +278,7 @@ def _span(values: FloatArray) -> tuple[float, float]:
     return low - pad, high + pad
 
 
-def _heat(u: FloatArray, power: FloatArray) -> Spec:
+def _heat(u: FloatArray, power: FloatArray, hover: str) -> Spec:
     (x0, dx), (y0, dy), counts = density(u, power, _COLUMNS, _ROWS)
     most = max(1, int(counts.max(initial=0)))
     # The colour scale is logarithmic in the count.
@@ -285,7 +291,7 @@ def _heat(u: FloatArray, power: FloatArray) -> Spec:
         'z': [[c or None for c in row] for row in counts.tolist()],
         'zmin': 1, 'zmax': max(2, most), 'hoverongaps': False,
         'colorscale': [[float(p), plot.token(f'density-{k}')] for k, p in enumerate(places)],
-        'hovertemplate': 'u %{x:.4~g}<br>%{y:.4~g} MW<br>%{z} samples<extra></extra>',
+        'hovertemplate': f'{hover}<br>%{{z}} samples<extra></extra>',
     }  # fmt: skip
 
 
@@ -305,11 +311,11 @@ def _bands(data: Identified, u_samples: FloatArray) -> list[Spec]:
 
 
 def _breakpoints(data: Identified) -> Spec:
-    c = data.characteristic
+    c = data.shown
     u, x = c.breakpoints[1:-1], c.values()[1:-1]
     low, high = np.array(c.breakpoint_intervals, dtype=np.float64).reshape(-1, 2).T
     hover = [
-        f'breakpoint at u {say.plain(float(b), 5)}'
+        f'breakpoint at {say.input_name(c.pressure_exponent)} {say.plain(float(b), 5)}'
         + (f'<br>95 %: {say.plain(float(lo), 5)} to {say.plain(float(hi), 5)}'
            if math.isfinite(lo) and math.isfinite(hi) else '')
         for b, lo, hi in zip(u, low, high, strict=True)
@@ -344,16 +350,17 @@ def segments_figure(data: Identified) -> Figure | None:
     found = segment_residuals(c, data.segments)
     if len(found) < _LEAST:
         return None
-    unit = say.input_unit(c.pressure_exponent)
+    unit = say.input_unit(data.shown.pressure_exponent)
+    name = say.input_name(data.shown.pressure_exponent)
     y, marker = plot.rounded(found.residual_mw), {'opacity': 0.75}
     traces = [
-        plot.points(plot.rounded(found.u, 6), y, 'over u', 'chosen',
-               f'u %{{x:.4~g}} {unit}<br>%{{y:+.3~g}} MW<extra></extra>', marker=marker),
+        plot.points(plot.rounded(found.u / data.u_per_percent, 6), y, f'over {name}', 'chosen',
+               f'{name} %{{x:.4~g}} {unit}<br>%{{y:+.3~g}} MW<extra></extra>', marker=marker),
         plot.points(plot.packed(found.time_ns / 1e6), y, 'over time', 'chosen',
                f'{DAY_HOUR}%{{y:+.3~g}} MW<extra></extra>', marker=marker, xaxis='x2', yaxis='y2'),
     ]  # fmt: skip
     layout: Spec = {
-        'xaxis': plot.axis(f'u ({unit})', domain=[0.0, 0.47], anchor='y'),
+        'xaxis': plot.axis(f'{name} ({unit})', domain=[0.0, 0.47], anchor='y'),
         'xaxis2': plot.time_axis(domain=[0.53, 1.0], anchor='y2', nticks=4),
         'yaxis': plot.axis('measured less curve (MW)'),
         'yaxis2': {'anchor': 'x2', 'matches': 'y', 'showticklabels': False},
@@ -361,13 +368,13 @@ def segments_figure(data: Identified) -> Figure | None:
         'showlegend': False,
     }
     caption = (
-        '<b>The points should scatter about zero, at every u and at every time.</b> Each is a '
-        'special segment. A bend on the left: the curve lacks a piece. A step or a slope on the '
-        'right: the unit changed while the data were taken, and diagnose may say why.'
+        f'<b>The points should scatter about zero, at every {name} and at every time.</b> Each '
+        'is a special segment. A bend on the left: the curve lacks a piece. A step or a slope on '
+        'the right: the unit changed while the data were taken, and diagnose may say why.'
     )
     words = (
-        f'Mean residual of {say.counted(len(found), "segment")} over u and over time; they spread '
-        f'by {say.plain(float(np.std(found.residual_mw)), 2)} MW.'
+        f'Mean residual of {say.counted(len(found), "segment")} over {name} and over time; they '
+        f'spread by {say.plain(float(np.std(found.residual_mw)), 2)} MW.'
     )
     return Figure('residuals', caption, words, traces, layout, height=340)
 
@@ -378,33 +385,34 @@ def shift_section(data: Identified) -> Section | None:
     if shift is None or data.reference is None:
         return None
     told = html.text(shift.sentence)
+    name, scale = say.input_name(data.shown.pressure_exponent), data.u_per_percent
     head = [
-        'piece', 'u', 'moved', 'now (MW)', '% of flow', 'curves differ in the middle by (MW)',
+        'piece', name, 'moved', 'now (MW)', '% of flow', 'curves differ in the middle by (MW)',
         'along the piece (MW)', 'confidence', 'smallest shift seen (MW)',
     ]  # fmt: skip
     parts: list[str | Figure] = [
         html.notice(told) if shift.moved else html.paragraph(told),
-        html.table(head, [_row(k, piece) for k, piece in enumerate(shift.pieces, 1)]),
+        html.table(head, [_row(k, piece, scale) for k, piece in enumerate(shift.pieces, 1)]),
     ]
     found = segment_residuals(data.reference, data.segments)
     if len(found):
-        parts.append(_shift_figure(shift, found))
+        parts.append(_shift_figure(shift, found, name, scale))
     return Section('Against the reference', parts)
 
 
-def _row(number: int, p: PieceShift) -> list[str]:
+def _row(number: int, p: PieceShift, scale: float) -> list[str]:
     if not math.isfinite(p.u_from):
         return [str(number), 'not in the reference', *[''] * 7]
     sure = f'> {100.0 * _SURE:g} %' if p.confidence > _SURE else f'{100.0 * p.confidence:.1f} %'
     return [
-        str(number), say.span(p.u_from, p.u_to), '<b>yes</b>' if p.moved else 'no',
+        str(number), say.span(p.u_from / scale, p.u_to / scale), '<b>yes</b>' if p.moved else 'no',
         say.with_error(p.now_mw, p.now_error_mw) if math.isfinite(p.now_mw) else '–',
         say.decimals(p.percent, 2) if p.moved else '–', say.with_error(p.middle_mw, p.error_mw),
         say.span(p.low_mw, p.high_mw, 2), sure, say.plain(p.smallest_mw, 2),
     ]  # fmt: skip
 
 
-def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
+def _shift_figure(shift: Shift, found: SegmentResiduals, u: str, scale: float) -> Figure:
     moved = np.zeros(len(found), dtype=bool)
     for p in shift.pieces:
         if p.moved:
@@ -413,8 +421,8 @@ def _shift_figure(shift: Shift, found: SegmentResiduals) -> Figure:
     traces = [
         plot.points(
             plot.packed(part.time_ns / 1e6), plot.rounded(part.residual_mw), name, colour,
-            f'{DAY_HOUR}u %{{customdata:.4~g}}<br>%{{y:+.3~g}} MW<extra>{name}</extra>',
-            customdata=plot.rounded(part.u),
+            f'{DAY_HOUR}{u} %{{customdata:.4~g}}<br>%{{y:+.3~g}} MW<extra>{name}</extra>',
+            customdata=plot.rounded(part.u / scale),
         )
         for keep, name, colour in looks if keep.any() for part in (found.part(keep),)
     ]  # fmt: skip

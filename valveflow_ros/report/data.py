@@ -139,31 +139,31 @@ def coverage_figure(data: Identified) -> Figure | None:
     special, _ = np.histogram(data.u[data.special], bins=edges)
     x = plot.rounded(0.5 * (edges[1:] + edges[:-1]), 6)
     hours = data.period_ns / 3600e9
+    c, u = data.shown, say.input_name(data.shown.pressure_exponent)
     traces: list[Spec] = [
         {
             'type': 'bar', 'name': name, 'x': x, 'y': plot.rounded(rows * hours, 4),
             'marker': {'color': plot.token(colour)},
-            'hovertemplate': f'u %{{x:.0f}}<br>%{{y:.2f}} h<extra>{name}</extra>',
+            'hovertemplate': f'{u} %{{x:.0f}}<br>%{{y:.2f}} h<extra>{name}</extra>',
         }
         for rows, name, colour in (
             (every - special, 'other', 'data-soft'), (special, 'special segments', 'density-3'),
         )
     ]  # fmt: skip
-    c = data.characteristic
     layout: Spec = {
         'xaxis': plot.axis(say.input_axis(c.pressure_exponent)),
         'yaxis': plot.axis('time there (h)', rangemode='tozero'),
         'barmode': 'stack', 'bargap': 0, 'showlegend': True,
-        'shapes': [plot.upright(float(u), 'curve', 1.5, dash='dot') for u in c.breakpoints[1:-1]],
+        'shapes': [plot.upright(float(b), 'curve', 1.5, dash='dot') for b in c.breakpoints[1:-1]],
     }  # fmt: skip
     share = say.percent(len(data.special) / len(known), 2)
     caption = (
-        '<b>Every piece needs special segments.</b> How long the unit ran at each u; blue, the '
+        f'<b>Every piece needs special segments.</b> How long the unit ran at each {u}; blue, the '
         f'part in special segments, {share} of all. Dotted, the breakpoints. Where there is '
         'little blue, more data at that load would make the curve more certain.'
     )
     words = (
-        f'Hours by u from {say.plain(float(edges[0]))} to {say.plain(float(edges[-1]))}; '
+        f'Hours by {u} from {say.plain(float(edges[0]))} to {say.plain(float(edges[-1]))}; '
         f'{share} of the time lies in special segments.'
     )
     return Figure('coverage', caption, words, traces, layout, height=320)
@@ -218,8 +218,9 @@ _KINDS = (
 
 
 def signals_figure(data: Identified) -> Figure:
-    """Return u and power over time (Fig. 5 of the paper)."""
-    unit = say.input_unit(data.characteristic.pressure_exponent)
+    """Return u, or the opening, and power over time (Fig. 5 of the paper)."""
+    unit = say.input_unit(data.shown.pressure_exponent)
+    u = say.input_name(data.shown.pressure_exponent)
     time_ns = data.table.time_ns
     days = (int(time_ns[-1]) - int(time_ns[0])) / 86400e9 if len(time_ns) else 0.0
     # Buttons for the last hours or days, if the log is longer.
@@ -239,7 +240,7 @@ def signals_figure(data: Identified) -> Figure:
     layout = {
         'xaxis': across,
         'margin': {'l': 60, 'r': 12, 't': 34, 'b': 96 if steps else 46},
-        'yaxis': plot.axis(f'u ({unit})', domain=[0.54, 1.0]),
+        'yaxis': plot.axis(f'{u} ({unit})', domain=[0.54, 1.0]),
         'yaxis2': plot.axis('power (MW)', domain=[0.0, 0.48]),
     }
     steady, slope = (len(data.rows_of(kind)) for kind, _, _ in _KINDS)
@@ -254,7 +255,7 @@ def signals_figure(data: Identified) -> Figure:
         '<span class="mouse">Drag to zoom, double-click to return.</span>'
     )
     words = (
-        f'Integrated input and generated power over time with '
+        f'{u.capitalize()} and generated power over time with '
         f'{say.counted(steady, "steady-state segment")} and '
         f'{say.counted(slope, "slope-response segment")} marked.'
     )

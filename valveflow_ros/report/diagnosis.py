@@ -90,9 +90,9 @@ def _answer(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
     )
     proof = (
         'On held-out data, the simulation differs from the measured power by '
-        f'{say.level(d.rmse_simulation, 2)} MW, the extended model by '
-        f'{say.level(d.rmse_extended, 2)} MW; {say.floor_words(d.disturbance is not None)} about '
-        f'{say.level(d.rmse_noise_floor, 2)} MW.'
+        f'{say.level(d.rmse_simulation, 2)} MW (root mean square), the extended model by '
+        f'{say.level(d.rmse_extended, 2)} MW. {say.floor_words(d.disturbance is not None)} '
+        f'would give about {say.level(d.rmse_noise_floor, 2)} MW.'
     )
     return html.section(
         'The answer', html.paragraph(said, 'good') if good else html.notice(said),
@@ -122,7 +122,7 @@ def _wrong(data: Diagnosed, ranked: Sequence[Signature]) -> Section:
 
 def _why(data: Diagnosed) -> Section:
     d = data.diagnosis
-    parts = [html.paragraph(html.text(c.sentence)) for c in d.causes or (d,)]
+    parts = [html.paragraph(html.text(c.sentence)) for c in d.causes]
     for c in d.causes:
         if c.switches_s:
             spans = times_in_effect(c.switches_s, data.start_ns, data.end_ns)
@@ -133,16 +133,27 @@ def _why(data: Diagnosed) -> Section:
                 f'{html.text(", ".join(c.not_told_apart))} with these data. What would tell '
                 f'them apart: {html.text(c.experiment)}'
             ))  # fmt: skip
-    rest = html.text(' and '.join(d.unexplained_by))
-    others = (f'<b>{html.text(name)}</b>: {html.text(reason)}' for name, reason in d.rejected)
+    others = (
+        f'<b>{html.text(", ".join(names))}</b>: {html.text(why)}'
+        for why, names in by_reason(d.rejected).items()
+    )
+    # With another verdict, or a drift, the answer says it.
+    beside = d.disturbance if d.verdict == NAMED and not _drifts(d) else None
     return html.section(
         '2. Why', *parts,
-        html.notice(f'Unexplained: depends on {rest}.') if rest else None,
-        html.paragraph(html.text(d.disturbance.sentence)) if d.disturbance else None,
-        html.paragraph('Other causes, and why they are not named:') + html.bullets(others)
+        html.paragraph(html.text(beside.sentence)) if beside else None,
+        html.paragraph('Causes that are not named, and why:') + html.bullets(others)
         if d.rejected else None,
         *(html.paragraph(html.text(note)) for note in d.notes),
     )  # fmt: skip
+
+
+def by_reason(rejected: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
+    """Return the names of the causes for each reason."""
+    found: dict[str, list[str]] = {}
+    for name, why in rejected:
+        found.setdefault(why, []).append(name)
+    return found
 
 
 def _model(data: Diagnosed) -> Section:
@@ -261,7 +272,8 @@ def cells(estimate: Estimate, exponent: float) -> tuple[str, str]:
         at, between = dates(estimate)
         return at, between or UNKNOWN
     unit = estimate.unit.replace(say.input_unit_plain(math.nan), say.input_unit_plain(exponent))
-    value = f'{say.plain(estimate.value)} {unit}'.strip()
+    number = say.count(round(estimate.value)) if unit == 'rows' else say.plain(estimate.value)
+    value = f'{number} {unit}'.strip()
     return value, say.interval(estimate.low, estimate.high)
 
 

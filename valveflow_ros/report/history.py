@@ -303,8 +303,8 @@ def alarms_table(history: History) -> str:
         stood += max(0, end - max(begin, until))
         until = max(until, end)
     changes = say.counted(len(shown), 'change')
-    held = f'Some alarm stood for {say.duration(stood / 1e9)} in all.'
-    told = held if stood else 'No alarm ever stood.'
+    held = f'Some alarm was active for {say.duration(stood / 1e9)} in all.'
+    told = held if stood else 'No alarm was ever active.'
     if len(history.alarms) > len(shown):
         told += f' The last {changes}:'
     body = html.table(['time', 'alarm', 'state', 'what it said'], rows, sentences=True)
@@ -392,7 +392,7 @@ def evidence_figure(
     words = (
         f'Mean residual and evidence of the residual alarm over '
         f'{say.duration((time_ns[-1] - time_ns[0]) / 1e9)}, with '
-        f'{say.counted(len(alarms), "interval")} in which the alarm stands.'
+        f'{say.counted(len(alarms), "interval")} in which the alarm is active.'
     )
     return Figure('evidence', caption, words, traces, layout, height=520)
 

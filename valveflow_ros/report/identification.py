@@ -42,6 +42,9 @@ from valveflow_ros.report.history import history_sections
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page, Section
 
+# Intervals of the monitor; and a unit, which the page would write in both columns.
+_NOT_SHOWN = 'refit_', 'generated_power_unit'
+
 
 def identification_report(data: Identified) -> str:
     """Return ``report.html``: one self-contained page that opens without a network."""
@@ -105,7 +108,8 @@ def _read(data: Identified) -> Iterator[str]:
     yield html.paragraph(html.text(temperature_words(c)))
     yield html.paragraph(
         f'Noise used for the thresholds, as standard deviation of block means: '
-        f'{say.plain(c.residuals.input_noise, 3)} in u, '
+        f'{say.plain(data.shown.residuals.input_noise, 3)} in '
+        f'{say.input_name(data.shown.pressure_exponent)}, '
         f'{say.plain(c.residuals.power_noise_mw, 3)} MW in power.'
     )
     yield html.bullets(map(html.text, data.notes)) if data.notes else ''
@@ -118,7 +122,7 @@ def _settings(settings: Settings) -> str:
             _shown(row.default),
         )]
         for name, row in PARAMETERS.items()
-        if settings[name] != row.default and not name.startswith('refit_')
+        if settings[name] != row.default and not name.startswith(_NOT_SHOWN)
     ]  # fmt: skip
     if not rows:
         return html.paragraph('Every parameter has its default value.')

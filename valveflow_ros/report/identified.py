@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -41,7 +42,8 @@ class Identified:
     misfit: Misfit | None = None  # systematic error of the curve
     mixture: str = ''  # a sentence that the unit changed within the data
     history: History | None = None  # of a monitor, if the log is its recording
-    u: FloatArray = field(init=False)  # (n,) argument of the curve: integrated input or opening
+    one_pressure: bool = False  # in all rows: the curve is shown over the opening
+    u: FloatArray = field(init=False)  # (n,) argument of the curve as shown: u or opening
     static_mw: FloatArray = field(init=False)  # (n,) the curve; the outer pieces are extrapolated
     rows: IntArray = field(init=False)  # (k, 2) first and end row (exclusive) of each segment
     special: IntArray = field(init=False)  # (m,) rows in segments with known input and power
@@ -57,7 +59,12 @@ class Identified:
         inside = [np.arange(a, b, dtype=np.int64) for a, b in rows.tolist()]
         special = np.concatenate([np.empty(0, dtype=np.int64), *inside])
         known = np.isfinite(u[special]) & np.isfinite(self.power[special])
-        derived = {'u': u, 'static_mw': static, 'rows': rows, 'special': special[known]}
+        derived = {
+            'u': u / self.u_per_percent,
+            'static_mw': static,
+            'rows': rows,
+            'special': special[known],
+        }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
 
@@ -67,8 +74,27 @@ class Identified:
         return self.table.column(Signal.GENERATED_POWER)
 
     @property
+    def median_pressure(self) -> float:
+        """Return the median pressure of the rows in MPa; NaN if there is none."""
+        pressure = self.table.column(Signal.MAIN_STEAM_PRESSURE)
+        known = pressure[np.isfinite(pressure)]
+        return float(np.median(known)) if len(known) else math.nan
+
+    @property
+    def u_per_percent(self) -> float:
+        """Return u of the curve for each % of opening if there is one pressure, else 1."""
+        q = self.characteristic.pressure_exponent if self.one_pressure else 0.0
+        return self.median_pressure**q if q else 1.0
+
+    @property
     def shown(self) -> Characteristic:
-        """Return the curve as drawn: at the reference pressure if it depends on the pressure."""
+        """Return the curve as drawn.
+
+        At the reference pressure if it depends on the pressure; over the opening if there is one
+        pressure, as a constant given by the user.
+        """
+        if self.one_pressure:
+            return self.characteristic.over_opening(self.median_pressure)
         return self.characteristic.at_pressure()
 
     @property

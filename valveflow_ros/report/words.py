@@ -193,7 +193,7 @@ def in_zone(said: str, zone: tzinfo | None) -> str:
 
 def floor_words(disturbed: bool) -> str:
     """Return what the estimate of the noise floor contains."""
-    return 'noise and the slow variation' if disturbed else 'noise alone'
+    return 'Noise and the slow variation' if disturbed else 'Noise alone'
 
 
 def period(start_ns: int, end_ns: int) -> str:
@@ -242,7 +242,7 @@ def input_unit_plain(value: float) -> str:
 def input_axis(value: float) -> dict[str, str]:
     """Return the title of an axis of u, and a short one for narrow figures, as HTML."""
     if value == 0.0:
-        return {'text': 'u = V, valve opening (%)', 'short': 'u = V (%)'}
+        return {'text': 'valve opening (%)', 'short': 'opening (%)'}
     m = exponent(value) if math.isfinite(value) else 'm'
     long = f'integrated input u = V p<sup>{m}</sup> ({input_unit(value)})'
     return {'text': long, 'short': f'u ({input_unit(value)})'}

@@ -82,6 +82,15 @@ class State(NamedTuple):
     counts: IntArray  # (5, reasons)
 
 
+def plausible_ranges(settings: Settings) -> FloatArray:
+    """Return the lowest and highest possible value of each signal, (5, 2)."""
+    limits = np.empty((N_SIGNALS, 2))
+    for info in SIGNALS:
+        name = 'valve_opening' if info.signal == Signal.VALVE_COMMAND else info.topic
+        limits[info.signal] = settings.real(f'{name}_low'), settings.real(f'{name}_high')
+    return limits
+
+
 class Rules(NamedTuple):
     """The settings of the kernel."""
 
@@ -365,12 +374,8 @@ class Aligner:
     def __init__(self, settings: Settings, covariates: tuple[str, ...] = ()) -> None:
         self._beside = Arriving(covariates) if covariates else None
         period = settings.real('sample_period')
-        limits = np.empty((N_SIGNALS, 2))
-        for info in SIGNALS:
-            name = 'valve_opening' if info.signal == Signal.VALVE_COMMAND else info.topic
-            limits[info.signal] = settings.real(f'{name}_low'), settings.real(f'{name}_high')
         self._rules = Rules(
-            limits=limits,
+            limits=plausible_ranges(settings),
             required=np.array([info.required for info in SIGNALS], dtype=np.uint8),
             period_ns=round(period * NS_PER_S),
             lateness_ns=round(settings.real('lateness') * NS_PER_S),

@@ -58,7 +58,8 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
 
 
 def _text(found: DiagnosisResult) -> str:
-    from valveflow_ros.report.diagnosis import cells
+    from valveflow_ros.diagnosis.result import NOTHING
+    from valveflow_ros.report.diagnosis import by_reason, cells
     from valveflow_ros.report.words import VERDICT_WORDS, advice, floor_words, level
 
     d = found.diagnosis
@@ -68,19 +69,22 @@ def _text(found: DiagnosisResult) -> str:
         for key, e in c.parameters.items()
     ]
     blind = 'cannot be judged'
-    unjudged: dict[str, list[str]] = {}
-    for name, why in d.rejected:
-        if why.startswith(blind):
-            unjudged.setdefault(why.removeprefix(blind).lstrip(': '), []).append(name)
-    judged = [f'  {", ".join(names)}: {why}' for why, names in unjudged.items()]
+    unchecked = [
+        f'  {", ".join(names)}: {why.removeprefix(blind).lstrip(": ")}'
+        for why, names in by_reason(d.rejected).items()
+        if why.startswith(blind)
+    ]
+    # The sentence of the verdict 'nothing' begins with it.
+    verdict = '' if d.verdict == NOTHING else f'{VERDICT_WORDS[d.verdict]}. '
     return command.lines(
-        f'{found.data.source}: {VERDICT_WORDS[d.verdict]}. {d.sentence}',
+        f'{found.data.source}: {verdict}{d.sentence}',
         *(advice(c.name, c.meaning, c.to_do) for c in d.causes),
         command.table(rows, ['cause', 'parameter', 'value', '95 % interval']),
         *(f'What would tell them apart: {e}' for e in d.experiments),
         'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
-        f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW, '
-        f'{floor_words(d.disturbance is not None)} about {level(d.rmse_noise_floor, 3)} MW.',
-        '\n'.join(['Not judged:', *judged]) if judged else '',
+        f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW. '
+        f'{floor_words(d.disturbance is not None)} would give about '
+        f'{level(d.rmse_noise_floor, 3)} MW.',
+        '\n'.join(['Could not be checked:', *unchecked]) if unchecked else '',
         *d.notes,
     )

@@ -104,7 +104,8 @@ def _text(found: Identified) -> str:
         f'The flow characteristic has {counted(len(c.pieces), "piece")} and explains '
         f'{percent(answer.explained(found))} of the variance of the power.',
         answer.pieces_doubt(c),
-        answer.form_words(c),
+        answer.range_words(found),
+        answer.form_words(found),
         _by_load(found),
         _pieces(found),
         _breakpoints(found.shown),

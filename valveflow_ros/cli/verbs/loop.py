@@ -20,6 +20,7 @@ needed. DIR gets loop.json.
 
 example:
   valveflow loop FIC101.csv -o result
+
 with column names that the program cannot recognise:
   valveflow loop trend.csv -o result --command A17 --process A18"""
 
@@ -56,17 +57,15 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     )  # fmt: skip
     path = found.write(options.output)
     content = found.to_json()
-    verdict = content['verdict']
-    if verdict == 'stiction' and 'position' not in found.names:
-        verdict = 'stiction or slack'  # only a measured position tells which
     sizes = [
         [key, f'{s["value"]:.3g}', f'{s["low"]:.3g} to {s["high"]:.3g}', str(s['unit'])]
         for key, s in found.judgement.sizes.items()
     ]
     taken = ', '.join(f'{role} {theirs}' for role, theirs in found.names.items())
     text = command.lines(
-        f'{options.table.name}: {verdict.replace("_", " ")}.',
+        f'{options.table.name}: {found.headline}.',
         content['reason'],
+        f'What to do: {found.to_do}' if found.to_do else '',
         command.table(sizes, ['size', 'value', '95 %', '']),
         f'Columns: {taken}; {content["rows"]} rows.',
         f'Wrote {path}.',

@@ -17,7 +17,7 @@ import numpy as np
 
 from valveflow_ros.diagnosis.loop import actuator, detectors, plug
 from valveflow_ros.diagnosis.loop.detectors import NO_STICTION, STICTION, Detection
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, counted
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 HEALTHY, OSCILLATING, NOT_JUDGED = 'healthy', 'oscillating', 'not_judged'
@@ -32,10 +32,7 @@ CONTRADICTED_GAIN = 25.0
 LEAST_ANSWER = 3.0
 """Log-likelihood by which the command must help to predict the response."""
 LEAST_PERIODS = 3.0
-_DOUBT = (
-    'A process that changes unmeasured, such as a varying supply pressure, can look the same: '
-    'to decide, put the controller in manual and make steps in both directions.'
-)
+_DOUBT = 'A process that changes unmeasured, such as a varying supply pressure, can look the same.'
 _MOST_ROWS = 20_000
 _WINDOW_ROWS = 1000  # the thresholds were determined on windows of 751 rows
 _MOST_FILLED = 3
@@ -161,7 +158,7 @@ def _judged(
     verdict, reason = _concluded(found, horch, turns, regular)
     period_s = swing.period * step_s if regular else np.nan
     if verdict == OSCILLATING:
-        reason = f'The loop swings with a period of {_seconds(period_s)} and {reason}'
+        reason = f'The loop swings with a period of {_seconds(period_s)}; {reason}'
         if aim is not None and _swings_along(aim, swing.period):
             reason += ' The set point swings with the same period: the cause lies before the loop.'
     asked = _asked(c, y, swing.period, horch) if regular else {}
@@ -250,7 +247,7 @@ def _of_fault(fault: actuator.ActuatorFault | None, rows: int) -> LoopJudgement:
     if fault is None:
         return LoopJudgement(
             HEALTHY,
-            'The position follows the command without stick band or slack; a loose linkage behind '
+            'The position follows the command without sticking or slack; a loose linkage behind '
             'the position sensor would not show.',
             rows=rows,
         )
@@ -389,10 +386,11 @@ def _concluded(
     asked = CONTRADICTED_GAIN if horch.answer == NO_STICTION else LEAST_GAIN
     if found.gain >= asked or found.travel >= LEAST_TRAVEL:
         seen = (
-            'a valve that stays behind explains the process value where the command alone does not'
+            'a valve that lags behind its command explains the process value better than the '
+            'command does'
             if found.gain >= asked
-            else 'the process value stands while the command travels, and moves after it has gone '
-            f'about {found.band:.2g} further'
+            else 'after a reversal the process value stands still until the command has moved '
+            f'about {found.band:.2g} % further'
         )
         if horch.answer == STICTION:
             seen += "; Horch's cross-correlation says the same"
@@ -400,23 +398,27 @@ def _concluded(
         clear = abs(found.jump_gain) >= plug.CLEAR_JUMP_GAIN
         fits = f'{better} fits better' if clear else 'both fit alike'
         return 'stiction', (
-            f'The valve sticks or has slack: {seen}. Which of the two only a measured position '
-            f'tells; here {fits}.'
+            f'The valve sticks or has slack: {seen}. Only a measured position can tell which of '
+            f'the two; here {fits}.'
         )
     if found.of_command < LEAST_ANSWER:
-        return NOT_JUDGED, 'The process value does not answer to the command.'
+        return (
+            NOT_JUDGED,
+            'The process value does not follow the command: check that both are of one loop.',
+        )
     if not regular and turns < 2.0 * LEAST_PERIODS - 1.0:
         return NOT_JUDGED, (
-            f'The command turned round {"once" if turns == 1 else f"{turns} times"}, which is '
-            f'fewer than {LEAST_PERIODS:.0f} full swings: no fault of the valve shows, but so few '
-            'do not show that it is sound.'
+            f'The command had {counted(turns, "reversal")} of {100.0 * _TURN:.0f} % of its range '
+            f'or more; {2.0 * LEAST_PERIODS - 1.0:.0f} are needed ({LEAST_PERIODS:.0f} full '
+            'swings). No fault of the valve shows, but so few reversals do not prove that it is '
+            'sound: take a longer record.'
         )
     if regular:
         return OSCILLATING, (
-            'no stick band or slack shows: the controller is tuned tightly, or the swing comes '
-            'from outside.'
+            'the valve shows no sign of sticking or slack: the controller is tuned too tightly, '
+            'or the swing comes from outside.'
         )
-    return HEALTHY, 'The process value follows the command; no stick band or slack shows.'
+    return HEALTHY, 'The process value follows the command, without a sign of sticking or slack.'
 
 
 def _swings_along(aim: FloatArray, period: float) -> bool:

@@ -158,10 +158,15 @@ class Matcher:
         taken = {*self._taken, *(c.place for c in chosen.values())}
         found = [
             name for k, name in enumerate(self.names)
-            if k not in taken and name and (unit := self.unit_of(k)) is not None
-            and unit.dimension == words.DIMENSIONS[signal]
+            if k not in taken and name and self._may_be(signal, k)
         ]  # fmt: skip
         return found[0] if len(found) == 1 else None
+
+    def _may_be(self, signal: Signal, place: int) -> bool:
+        unit = self.unit_of(place)
+        if unit is None and signal == Signal.GENERATED_POWER:
+            unit = words.flow_spelled(self._units[place])
+        return unit is not None and unit.dimension == words.DIMENSIONS[signal]
 
     def _refusal(
         self, absent: Mapping[Signal, str], several: list[str], missing: list[str],
@@ -177,18 +182,32 @@ class Matcher:
                 told.append(f'no {self.what} was recognised as {unknown}')
             unit = '' if topics == [TIME] else '[:unit]'
             options = ' '.join(f'--column {name}={THEIRS}{unit}' for name in topics)
-            cold = SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic
-            constant = ', or give --constant NAME=VALUE for what hardly changes'
-            if cold in missing:
-                constant = f', or the usual temperature with --constant {cold}={_USUAL_DEGC}'
+            constant = self._as_constant(missing, chosen)
             apart = f', or say with --period {PERIOD} how far apart the rows are' if times else ''
             parts.append(
                 f'{", ".join(told)}; the {self.what}s are: {self._have(chosen)}. Name '
-                f'yours with {options}{constant if missing else ""}{apart}'
+                f'yours with {options}{constant}{apart}'
             )
         remedies += [_naming(topic) for topic in topics if topic != TIME]
         remedies += [] if no_time is None else [no_time]
         return RefusedError(self.path, '; '.join(parts), remedies)
+
+    def _as_constant(self, missing: Collection[str], chosen: Mapping[Signal, Chosen]) -> str:
+        """Return the end of the sentence on signals that need no column; '' if each needs one."""
+        cold, steam = (
+            SIGNALS[s].topic for s in (Signal.MAIN_STEAM_TEMPERATURE, Signal.MAIN_STEAM_PRESSURE)
+        )
+        usual = f'--constant {cold}={_USUAL_DEGC}'
+        if steam not in missing:
+            return f', or the usual temperature with {usual}' if cold in missing else ''
+        added = [f'--constant {steam}=1', *([usual] if cold in missing else [])]
+        power = chosen.get(Signal.GENERATED_POWER)
+        topic = SIGNALS[Signal.GENERATED_POWER].topic
+        if power is not None and power.unit is None:
+            added.append(option(topic, split_unit(power.theirs)[0], 't/h'))
+        elif topic in missing:
+            added.append(option(topic, THEIRS, 't/h'))
+        return f'; for a control valve with opening and flow only, add {" ".join(added)}'
 
     def missing(self, theirs: str, name: str) -> RefusedError:
         """Return the error for a time column that the user named and that does not exist."""
