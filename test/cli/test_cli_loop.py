@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -13,6 +14,7 @@ from streams import needs_jit
 import valveflow_ros as vf
 from benchmarks.refinery_loops import simulate_loop
 from valveflow_ros.errors import InputError
+from valveflow_ros.interface.loop import HEADLINES
 from valveflow_ros.logs.tables.loop_columns import roles_of
 
 pytestmark = needs_jit
@@ -50,6 +52,10 @@ def test_the_file_keeps_its_contract_and_words_say_it(loop, frame, tmp_path):
     assert content['columns']['set_point'] == 'FIC101.SV'
     out = loop(frame).out
     assert out.startswith('FIC101.csv: stiction or slack, probable: 3 of 100 sound valves')
+    study = Path(__file__).parents[2] / 'benchmarks' / 'results' / 'refinery_valves.json'
+    counts = json.loads(study.read_text())['simulated']['all']['verdict']
+    assert f'{100.0 * counts["falsely_named"]:.0f} of 100 sound valves' in out
+    assert f'{10.0 * (1.0 - counts["found"]):.0f} of 10 faults' in HEADLINES['healthy'][0]
     assert '\nThe valve sticks or has slack: ' in out
     assert '\nWhat to do: Put the controller in manual' in out
     assert 'loop.json' in out

@@ -28,7 +28,7 @@ _MOST_GRID = 4
 
 # The verdict and how sure it is, without and with a measured position; the counts are rounded
 # from the study of simulated loops in docs/method.md.
-_HEADLINES = {
+HEADLINES = {
     'stiction': (
         'stiction or slack, probable: 3 of 100 sound valves in simulated loops are called so',
         'stiction, measured',
@@ -80,7 +80,7 @@ class LoopResult:
     @property
     def headline(self) -> str:
         """Return the verdict and how sure it is, in words without a full stop."""
-        return _HEADLINES[self.judgement.verdict][POSITION in self.names]
+        return HEADLINES[self.judgement.verdict][POSITION in self.names]
 
     @property
     def to_do(self) -> str:
