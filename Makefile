@@ -92,8 +92,9 @@ torture: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) for recording in '1s --seeds 10' 'compressed --seeds 10' 'minute --seeds 30'; do \
-	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input --first 901 \
+	@$(ENV) for recording in '1s --seeds 10 --first 901' 'minute --seeds 30 --first 901' \
+	  'compressed --seeds 10 --first 1101'; do \
+	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input \
 	  --recording $$recording || exit 1; done
 
 study-diagnosis: setup

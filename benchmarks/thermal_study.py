@@ -11,7 +11,8 @@ days, over the openings and pressures visited.
 it, and the weather in the error, were set after a first look at seeds 101 to 200, and the choice
 of the form by all rows (``fit/fit.py``) after one at seeds 306, 401 to 410 and 501 to 530.
 The joint fit of the exponent (``fit/refine.py``) was made while looking at the units 702, 704,
-706, 709, 712, 717, 724, 733, 736 and 738, the fit to long means with the units 601 to 613.
+706, 709, 712, 717, 724, 733, 736 and 738, the fit to long means with the units 601 to 613,
+the correction of held values with the units 601 to 605.
 """
 
 from __future__ import annotations

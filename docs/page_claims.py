@@ -56,7 +56,7 @@ def _kind_words(kind: str) -> str:
 
 _RECORDINGS = {
     'minute_901_930': 'means over a minute', '1s_901_910': 'every second',
-    'compressed_901_910': 'exceptions alone',
+    'compressed_1101_1110': 'exceptions alone',
 }  # fmt: skip
 
 

@@ -458,7 +458,7 @@ class TestOtherUnits:
         assert 'The log is compressed by exception: valve_opening typically every ' in said
         assert 'from changes of 2 MW on' in said
         assert 'The log has a value every' not in said
-        # Held pressures make m too small: no interval is claimed for it.
+        # Held pressures make m uncertain: no interval is claimed for it.
         exponent = [n for n in found.characteristic.notes if 'The exponent m' in n]
         assert len(exponent) == 1
         assert all('cannot be judged in this log' in note for note in exponent)
