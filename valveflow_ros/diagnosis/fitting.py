@@ -363,15 +363,21 @@ def improve(
 
     Parameters
     ----------
-    frozen_base : float64 (m, P), optional
-        Tangents of curve and dynamics, kept constant; they change little, and their
+    frozen_base : float64 (rows, P), optional
+        Whitened tangents of curve and dynamics, kept constant; they change little, and their
         computation takes most of the time.
     """
+    frozen_sums = None if frozen_base is None else frozen_base.T @ frozen_base
 
     def equations(model: Extended) -> tuple[FloatArray, FloatArray]:
-        base = frozen_base if frozen_base is not None else base_tangents(task, model)
-        table = task.innovations(np.column_stack([base, cause_tangents(task, model)]))
-        return table.T @ table, table.T @ task.innovations(task.residual(model))
+        base, sums = frozen_base, frozen_sums
+        if base is None or sums is None:
+            base = task.innovations(base_tangents(task, model))
+            sums = base.T @ base
+        causes = task.innovations(cause_tangents(task, model))
+        rest, across = task.innovations(task.residual(model)), base.T @ causes
+        normal = np.block([[sums, across], [across.T, causes.T @ causes]])
+        return normal, np.append(base.T @ rest, causes.T @ rest)
 
     return gauss_newton(
         model, task.cost, equations, lambda m, step: _stepped(task, m, step), steps,

@@ -538,7 +538,9 @@ def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
     screening = Screening(found.task, found.model, found.rough)
     shortlist = _shortlist(screening, barred)
     every = causes_for(found.task.grids)
-    tangents = base_tangents(found.task, found.model) if shortlist else None
+    tangents = None
+    if shortlist:
+        tangents = found.task.innovations(base_tangents(found.task, found.model))
     refits = []
     for name, start in shortlist:
         added = FittedCause(every[name], start.values, start.extra)
