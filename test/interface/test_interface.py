@@ -31,6 +31,7 @@ from valveflow_ros.report.words import moment, percent
 from valveflow_ros.signals.align import Aligner
 
 QUICK = {'refine': False, 'selection_rule': 'paper'}
+JUNE_NS = 1_717_200_000 * 10**9
 
 
 HEAVY = {'numpy', 'numba', 'scipy', 'pandas', 'pyarrow', 'plotly', 'yaml'}
@@ -464,6 +465,15 @@ class TestOtherUnits:
         assert all('cannot be judged in this log' in note for note in exponent)
         refused = {n for c in found.data.counts.values() for r, n in c.items() if r != 'accepted'}
         assert refused == {0}
+
+    def test_a_change_is_not_dated_in_a_compressed_log(self):
+        unit = {'unit': 'choked:number=41', 'recording': 'compressed'}
+        reference = vf.identify(vf.simulate(6, 8, **unit).log).characteristic
+        changed = vf.simulate(6, 108, ['gain_step:g=-0.03,t0_days=0'], start_ns=JUNE_NS, **unit)
+        shift = vf.identify(changed.log, reference=reference).data.shift
+        assert shift.moved
+        assert shift.since_ns == 0
+        assert 'since when is not known' in shift.sentence
 
     def test_tables_hold_further_columns(self, tmp_path):
         plant = vf.simulate(0.01, 3, unit='sequence')

@@ -199,7 +199,10 @@ def identify(
     if reference is not None:
         settings = found.settings
         limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
-        shift = judge_shift(reference, found.characteristic, found.segments, limits)
+        # Held values differ from segment to segment by more than the noise within one: they gave
+        # dates to changes that were older than the log.
+        segments = () if log.compression else found.segments
+        shift = judge_shift(reference, found.characteristic, segments, limits)
         found = replace(found, shift=shift, reference=reference)
     return Identification(found, log, model)
 
