@@ -439,7 +439,7 @@ def _rounded(task: Task, rival: Rival) -> str:
 
 
 def _as_knots(found: SearchResult, rival: Rival) -> bool:
-    """Put back the breakpoints in place of a bump if they explain the data better."""
+    """Put the breakpoints back if they explain the data better than a bump; tell if they do."""
     if found.with_knots is None:
         return False
     model, _ = improve(found.task, replace(found.model, base=found.with_knots.base), 4)

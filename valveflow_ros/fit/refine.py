@@ -51,7 +51,7 @@ from valveflow_ros.signals.static_form import exponents_near
 # changes by the bias that this noise causes, and this change is subtracted from the first fit.
 #
 # Values that a historian holds between two stored ones are wrong in another way: exponents of the
-# pressure come out too small, by up to 0.07. There the bias is the change of the fit to the power
+# pressure come out too small, by about 0.05. There the bias is the change of the fit to the power
 # that the model itself would have stored (indirect inference: Gourieroux, Monfort and Renault,
 # J. Appl. Econometrics 8, 1993).
 

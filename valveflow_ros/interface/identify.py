@@ -281,11 +281,12 @@ def _of_compressed(c: Characteristic, log: Log) -> Characteristic:
     if pressure is None or not (said := [n for n in c.notes if n.startswith(EXPONENT_NOTES)]):
         return c
     # After the correction of held values, m was off by up to 0.07 on 20 units of
-    # `benchmarks.thermal_study` (1101 to 1110), more than its interval allows.
+    # `benchmarks.thermal_study` (1101 to 1110, dead band 0.13 MPa).
     hidden = (
         'The exponent m of the pressure and the power without flow cannot be judged in this log: '
         f'the historian keeps a pressure until it has changed by {pressure.dead_band:.2g} MPa. '
-        f'The curve was found with m = {c.static_form.exponent:.2f}, which may be off by 0.07.'
+        f'The curve was found with m = {c.static_form.exponent:.2f}, which may be off by some '
+        'hundredths.'
     )
     return replace(c, notes=(*(n for n in c.notes if n not in said), hidden))
 
