@@ -205,6 +205,8 @@ class TestIdentify:
         ({'parameters': {'time_constnt': 3}}, InputError, "did you mean 'time_constant'"),
         ({'step_test': True}, DataError, 'no step test'),
         ({'step_test': True, 'model': 'x.json'}, UsageError, 'do not go together'),
+        ({'model': 3}, UsageError, 'must be ExtendedModel, or the path of one; it is int'),
+        ({'reference': 3}, UsageError, 'must be Characteristic, or the path of one; it is int'),
     ])  # fmt: skip
     def test_what_does_not_go_is_refused(self, log, options, error, said):
         with pytest.raises(error, match=said):
@@ -248,6 +250,10 @@ class TestIdentify:
 def test_a_curve_is_held_against_other_days(log, identified, tmp_path):
     found = vf.validate(log, identified.characteristic, parameters=QUICK)
     assert found.to_json()['model'] == identified.characteristic.model_id
+    # The result that has the curve does as well as the curve.
+    assert vf.validate(log, identified, parameters=QUICK).to_json() == found.to_json()
+    for shown in (found, identified, log):  # in a notebook
+        assert len(repr(shown)) < 500 and 'array' not in repr(shown)
     assert found.validation.overall.segments > 5
     assert len(found.plot().data) > 0
     names = set(found.write(tmp_path).files)

@@ -32,7 +32,7 @@ from valveflow_ros.report.words import held_words, percent
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class ComparisonResult(Result):
     """The proposed method and two methods of the literature; ``data`` is shown in the report."""
 
@@ -48,6 +48,9 @@ class ComparisonResult(Result):
     def comparison(self) -> comparison.Comparison:
         """Return the curves, errors and tests."""
         return self.data.result
+
+    def _sentence(self) -> str:
+        return ' '.join((data_words(self.data), *finding_words(self.data)[:1]))
 
     def page(self) -> Page:
         """Return the report."""
@@ -74,7 +77,7 @@ class ComparisonResult(Result):
         }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class ValidationResult(Result):
     """A curve compared with a log; ``data`` is shown in the report."""
 
@@ -90,6 +93,9 @@ class ValidationResult(Result):
     def validation(self) -> validation.Validation:
         """Return the verdict, the pieces and the errors."""
         return self.data.result
+
+    def _sentence(self) -> str:
+        return validation_report.verdict_words(self.data)[0]
 
     def page(self) -> Page:
         """Return the report."""
@@ -190,7 +196,7 @@ def validate(
     ----------
     log : Log, str, Path or pandas.DataFrame
         The result of `open_log`, or anything that it opens.
-    model : Characteristic, ExtendedModel or path
+    model : Characteristic, ExtendedModel, a result that has one, or path
     against : Characteristic or path, optional
         A second curve; the result says which of the two is better.
     tolerance_mw : float, optional
@@ -241,8 +247,9 @@ def validate(
 
 def _name(model: Model | str | Path, other: Model | str | Path | None) -> str:
     """Return a file's name, with its folder if a folder was given or two names would be equal."""
-    if isinstance(model, Characteristic | ExtendedModel):
-        return getattr(model, 'model_id', '') or 'the model'
+    if not isinstance(model, str | Path):
+        curve = getattr(model, 'characteristic', model)  # of a result
+        return getattr(curve, 'model_id', '') or 'the model'
     file = models.model_path(Path(model))
     alike = isinstance(other, str | Path) and models.model_path(Path(other)).name == file.name
     return str(file) if alike or file != Path(model) else file.name

@@ -57,7 +57,7 @@ _TAKE_IT_OUT = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class DiagnosisResult(Result):
     """A diagnosis.
 
@@ -93,6 +93,9 @@ class DiagnosisResult(Result):
     def output_unit(self) -> str:
         """Return the unit of the log's output."""
         return self.data.output_unit
+
+    def _sentence(self) -> str:
+        return self.diagnosis.sentence
 
     def page(self) -> Page:
         """Return the report."""

@@ -42,7 +42,7 @@ from valveflow_ros.records import (
     Signal,
     SpecialSegment,
 )
-from valveflow_ros.report.answer import doubt
+from valveflow_ros.report.answer import doubt, range_words
 from valveflow_ros.report.identification import identification_page
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Page
@@ -64,7 +64,7 @@ STATIC_ADVICE = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Identification(Result):
     """An identified flow characteristic.
 
@@ -107,6 +107,10 @@ class Identification(Result):
     def output_unit(self) -> str:
         """Return the unit of the curve's output."""
         return self.data.characteristic.output_unit
+
+    def _sentence(self) -> str:
+        told = (f'{self.data.source}:', doubt(self.data), range_words(self.data))
+        return ' '.join(filter(None, told))
 
     def page(self) -> Page:
         """Return the report."""

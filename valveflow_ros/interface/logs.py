@@ -39,7 +39,7 @@ from valveflow_ros.records import (
     Signal,
     table_to_readings,
 )
-from valveflow_ros.report.words import moment
+from valveflow_ros.report.words import duration, moment
 from valveflow_ros.signals.compression import Compression, find_compression, held_readings
 from valveflow_ros.signals.units import (
     DIFFERENCES,
@@ -51,7 +51,7 @@ from valveflow_ros.signals.units import (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Log:
     """A log that was read, and its interpretation.
 
@@ -89,6 +89,11 @@ class Log:
     updates: Readings | None = None
     source: Any = None
     mapping: LogMapping = field(default_factory=LogMapping)
+
+    def __repr__(self) -> str:
+        """Return what the log contains, without its readings."""
+        columns = ', '.join(f'{SIGNALS[s].topic} in {unit}' for s, unit in self.units.items())
+        return f'<Log: {self.name}, {duration(self.span_s)}: {columns}>'
 
     @property
     def recorded(self) -> Readings:

@@ -56,7 +56,7 @@ _TO_DO = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class LoopResult:
     """The result for the valve of a control loop.
 
@@ -76,6 +76,10 @@ class LoopResult:
     names: dict[str, str]
     time_s: FloatArray
     columns: dict[str, FloatArray]
+
+    def __repr__(self) -> str:
+        """Return the verdict and its reason; all the data would fill pages of a notebook."""
+        return f'<LoopResult: {self.headline}. {self.judgement.reason}>'
 
     @property
     def headline(self) -> str:

@@ -15,7 +15,7 @@ from valveflow_ros.curve.characteristic_json import FORMAT, from_json
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.result import is_model, model_from_json
 from valveflow_ros.errors import DataError, RecordingError, UsageError
-from valveflow_ros.interface.files import reason
+from valveflow_ros.interface.files import Result, reason
 
 Model = Characteristic | ExtendedModel
 Read = TypeVar('Read', bound=Model)
@@ -85,12 +85,14 @@ def taken_model(
     RecordingError
         The file cannot be read.
     UsageError
-        The parameters give another exponent. A curve over the opening has none.
+        It is no model; or the parameters give another exponent. A curve over the opening has none.
     """
     given = dict(parameters or {})
     if model is None:
         return None, given
-    name, read = (model, load(model)) if isinstance(model, str | Path) else ('The model', model)
+    name = model if isinstance(model, str | Path) else 'The model'
+    kinds = (ExtendedModel,) if load is load_extended else (Characteristic, ExtendedModel)
+    read = _taken(model, load, kinds)
     exponent = read.pressure_exponent
     if exponent == 0.0:
         return read, given
@@ -105,7 +107,20 @@ def taken_model(
 
 def taken_curve(curve: Characteristic | str | Path | None) -> Characteristic | None:
     """Return a curve, read if a path is given; raises as `load_characteristic`."""
-    return load_characteristic(curve) if isinstance(curve, str | Path) else curve
+    return None if curve is None else _taken(curve, load_characteristic, (Characteristic,))
+
+
+def _taken(given: Any, load: Callable[[str | Path], Read], kinds: tuple[type[Any], ...]) -> Read:
+    """Return a model that is given as itself, as the result that has it, or as a path."""
+    if isinstance(given, str | Path):
+        return load(given)
+    names = ('extended_model', 'characteristic') if isinstance(given, Result) else ()
+    found: Any = next((getattr(given, n) for n in names if hasattr(given, n)), given)
+    if not isinstance(found, kinds):
+        wanted, not_it = ' or '.join(k.__name__ for k in kinds), type(given).__name__
+        raise UsageError(f'The model must be {wanted}, or the path of one; it is {not_it}.')
+    read: Read = found
+    return read
 
 
 def check_output(unit: str, **models: Model | None) -> None:

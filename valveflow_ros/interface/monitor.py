@@ -52,7 +52,7 @@ _RESIDUAL = ResidualAlarm.NAME
 Kind = TypeVar('Kind')
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class MonitorResult(Result):
     """The outputs of a monitor over a log.
 
@@ -210,6 +210,10 @@ class MonitorResult(Result):
             ),
             tuple(reported.DiagnosisMoment(at, d['sentence']) for at, d in self.diagnoses),
         )
+
+    def _sentence(self) -> str:
+        alarms = [sentence for _, sentence in self.standing] or ['No alarm stands at the end.']
+        return ' '.join((f'{counted(len(self.curves), "curve")}.', *alarms, *self.named))
 
     def page(self) -> html.Page:
         """Return the report: the changes of the curve, and the outputs of the monitor."""

@@ -24,7 +24,7 @@ from valveflow_ros.records import SIGNALS, FloatArray
 PAPER = 'paper'
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Simulation:
     """A simulated log and its true values.
 
@@ -39,6 +39,10 @@ class Simulation:
     data: SimulatedLog | ThermalLog
     days: float
     seed: int
+
+    def __repr__(self) -> str:
+        """Return what was simulated, without the values."""
+        return f'<Simulation: {self.days:g} days, seed {self.seed}>'
 
     @property
     def log(self) -> Log:
