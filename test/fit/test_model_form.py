@@ -150,9 +150,21 @@ def test_the_unit_of_power_missing_values_and_the_order_of_segments_change_nothi
     assert holed.form.exponent == pytest.approx(found.form.exponent, abs=0.02)
 
 
+@pytest.mark.parametrize('seed', range(6))
+def test_two_hours_that_visit_the_range_tell_the_form(seed) -> None:
+    """A day of a healthy unit may have no more: without the form its curve was 20 MW off."""
+    for form in (OPENING, INTEGRATED_INPUT):
+        v, p, y, spans = unit(form, 'bent', seed)
+        few = np.column_stack([spans[:12, 0], spans[:12, 0] + PER_HOUR // 6])
+        found = find_form(v, p, y, few, PERIOD_S, PAPER)
+        assert found is not None
+        assert found.form.axis == form or not found.evidence.told
+
+
 def test_too_few_means_tell_no_form_and_cannot_be_put_into_one() -> None:
     v, p, y, spans = unit(OPENING, 'bent', 5)
-    for few in (spans[:3], spans[:0]):
+    half_an_hour = spans[:1] // [1, 2]
+    for few in (half_an_hour, spans[:0]):
         assert find_form(v, p, y, few, PERIOD_S, PAPER) is None
         with pytest.raises(TooFewSamplesError, match='numbers of'):
             find_form(v, p, y, few, PERIOD_S, PAPER, axis=OPENING)

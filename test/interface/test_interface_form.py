@@ -208,7 +208,8 @@ def test_loads_in_sentences_are_those_of_the_plant():
         assert short.characteristic.power([opening], [pressure]) == pytest.approx(power, abs=5.0)
 
 
-def test_too_little_data_for_an_axis_that_is_asked_for_is_refused():
-    short = vf.simulate(0.3, 1)
+def test_where_the_segments_are_too_few_to_try_a_form_it_is_said():
+    short = vf.simulate(0.5, 607, unit='choked:number=607')
     with pytest.raises(DataError, match=r'numbers of p\^m F\(V\) \+ c'):
         vf.identify(short.log, parameters={'axis': OPENING})
+    assert 'could not be tried' in vf.identify(short.log).page().to_html()

@@ -183,7 +183,7 @@ def _form_errors(
         said += f' ± {_Z95 * result.exponent_stderr:.3f}'
     if static.axis == OPENING:
         error = _Z95 * math.sqrt(max(float(result.covariance[-1, -1]), 0.0))
-        said += f'; the power without flow is c = {result.model.offset:.1f} ± {error:.1f} MW'
+        said += f'; the constant c is {result.model.offset:.1f} ± {error:.1f} MW'
     if not at_end:
         return (f'{said}.',)
     return (
@@ -279,13 +279,13 @@ def with_support(
     return replace(c, support=support, notes=(*c.notes, *_support_notes(c, support)))
 
 
-def wrong_form(c: Characteristic) -> str:
+def wrong_form(c: Characteristic, why: str = 'was given') -> str:
     """Return a sentence if the form was given and is wrong; otherwise an empty text."""
     form = c.form
     if form is None or not form.contradicted:
         return ''
     return (
-        f'The form of this curve, {c.static_form.words}, was given and is the wrong one: on '
+        f'The form of this curve, {c.static_form.words}, {why} and is the wrong one: on '
         f'stretches held out the power follows {form.other} to {form.rmse_other_mw:.2g} MW and '
         f'this form to {form.rmse_mw:.2g} MW; {forms_apart(form)}.'
     )

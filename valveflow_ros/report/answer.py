@@ -94,9 +94,19 @@ def form_words(data: Identified) -> str:
     c, form = data.characteristic, data.characteristic.form
     if data.one_pressure and c.choice.rule not in (RULE, STATIC_RULE):  # they have a note
         return 'The pressure is the same in all rows: the curve holds at that pressure only.'
+    mine = c.static_form.words
+    if form is None and c.choice.rule not in (RULE, STATIC_RULE):
+        pressure = data.table.column(Signal.MAIN_STEAM_PRESSURE)[data.special]
+        if not len(pressure) or pressure_range(pressure) < LEAST_PRESSURE_RANGE:
+            return ''
+        other = 'F(V p^m)' if c.axis == OPENING else 'p^m F(V) + c'
+        return (
+            f'Whether the power follows {mine}, as this curve does, or {other} could not be '
+            'tried: the special segments are too few. At another pressure than is usual for an '
+            'opening the curve may be wrong by several MW. A longer log would help.'
+        )
     if form is None or form.contradicted:
         return ''
-    mine = c.static_form.words
     if not form.told:
         return (
             f'Whether the power follows {mine}, as this curve does, or {form.other} cannot be '
@@ -115,6 +125,7 @@ def form_words(data: Identified) -> str:
 _LOADS = 50.0, 20.0, 10.0, 5.0  # steps of the table by load, MW
 _NEAR = 0.02  # of the range of the power: rows at a load
 _LEAST_ROWS = 20
+_SMALL_MPA = 2.0  # below it, as of a pressure difference, one decimal would hide the change
 _PRESSURES = 41  # between the ends of the pressures at a load
 
 
@@ -180,19 +191,21 @@ def gain_by_load(data: Identified) -> list[LoadGain]:
 
 def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of MW per % of opening by load."""
-    unit = data.characteristic.output_unit
+    unit, gains = data.characteristic.output_unit, gain_by_load(data)
+    digits = 1 if all(g.pressure_high > _SMALL_MPA for g in gains) else 3
     head = [f'load ({unit})', 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
             f'{unit} per 1 % of opening', '95 % interval', 'over that range']  # fmt: skip
     cells = [
         [
-            say.decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1), say.decimals(g.pressure, 1),
-            f'{say.decimals(g.pressure_low, 1)} to {say.decimals(g.pressure_high, 1)}',
+            say.decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1),
+            say.decimals(g.pressure, digits),
+            f'{say.decimals(g.pressure_low, digits)} to {say.decimals(g.pressure_high, digits)}',
             say.decimals(g.opening, 1), say.plain(g.gain, 3),
             f'{say.plain(g.gain - g.error, 3)} to {say.plain(g.gain + g.error, 3)}'
             if g.error > 0.0 else '-',
             f'{say.plain(g.low, 3)} to {say.plain(g.high, 3)}',
         ]
-        for g in gain_by_load(data)
+        for g in gains
     ]  # fmt: skip
     if data.one_pressure:  # then there is no range of pressures
         head, *cells = ([row[0], *row[3:6]] for row in (head, *cells))
