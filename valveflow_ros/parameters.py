@@ -234,7 +234,7 @@ _MODEL = (
               choices=('auto', 'integrated_input', 'opening')),
     Parameter('pressure_exponent', 1.125, '',
               'Exponent m of u = V p^m, eq. (1) of the paper, unless the data choose another.',
-              0.5, 2.0),
+              0.4, 2.0),
     Parameter('time_constant', 80.0, 's',
               'Largest time constant T expected; with delay it sets the transient 5 T + tau '
               'that does not count after a move begins.', 0.1, 3600.0),

@@ -40,7 +40,7 @@ from valveflow_ros.curve.json_schema import (
 )
 from valveflow_ros.errors import DataError
 from valveflow_ros.records import FLOW_UNITS
-from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, StaticForm
+from valveflow_ros.signals.static_form import AXES, INTEGRATED_INPUT, LEAST_EXPONENT, StaticForm
 
 
 def held_json(held: tuple[HeldCause, ...]) -> dict[str, Any]:
@@ -74,9 +74,6 @@ FORMAT = 'valveflow/characteristic'
 _WHOLE = 'characteristic'
 VERSION = 2
 _READABLE = (1, 2)
-
-
-_LEAST_EXPONENT = 0.5
 
 
 def number(value: float) -> float | None:
@@ -328,15 +325,15 @@ def form_of(top: dict[str, Any], whole: str, inside: str = '') -> StaticForm:
     axis = top['axis'] or INTEGRATED_INPUT
     scale, offset = top['pressure_scale_exponent'] or 0.0, top['offset_mw'] or 0.0
     if axis == INTEGRATED_INPUT:
-        if not top['pressure_exponent'] >= _LEAST_EXPONENT:
-            raise fail(whole, f'{inside}pressure_exponent', f'is below {_LEAST_EXPONENT:g}')
+        if not top['pressure_exponent'] >= LEAST_EXPONENT:
+            raise fail(whole, f'{inside}pressure_exponent', f'is below {LEAST_EXPONENT:g}')
         for name, value in (('pressure_scale_exponent', scale), ('offset_mw', offset)):
             if value != 0.0:
                 problem = f'is {value:g}, but must be 0 for the axis integrated_input'
                 raise fail(whole, f'{inside}{name}', problem)
         return StaticForm(axis, top['pressure_exponent'])
-    if not scale >= _LEAST_EXPONENT:
-        problem = f'is below {_LEAST_EXPONENT:g}'
+    if not scale >= LEAST_EXPONENT:
+        problem = f'is below {LEAST_EXPONENT:g}'
         raise fail(whole, f'{inside}pressure_scale_exponent', problem)
     return StaticForm(axis, scale)
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from valveflow_ros.numerics import jit
+from valveflow_ros.parameters import PARAMETERS
 from valveflow_ros.records import FloatArray
 
 INTEGRATED_INPUT = 'integrated_input'
@@ -24,6 +25,7 @@ PAPER_EXPONENT = 1.125
 # Allowed range of fitted exponents: 1 is ideal choked flow, 9/8 the paper's. Outside this range
 # one form imitates the other.
 EXPONENTS = 0.9, 1.25
+LEAST_EXPONENT = PARAMETERS['pressure_exponent'].low or 0.0  # also of a fitted one
 
 # Relative range of the pressure below which weather and the curve's own misfit decide form and
 # exponent: on units at fixed pressure intervals of 0.007 were 0.03 off.
@@ -39,7 +41,9 @@ def pressure_range(pressure_mpa: FloatArray) -> float:
 def exponents_near(exponent: float) -> tuple[float, float]:
     """Return the range in which to search: around an unusual one, as 0.5 of a liquid, 20 %."""
     low, high = EXPONENTS
-    return EXPONENTS if low <= exponent <= high else (0.8 * exponent, 1.2 * exponent)
+    if low <= exponent <= high:
+        return EXPONENTS
+    return max(0.8 * exponent, LEAST_EXPONENT), 1.2 * exponent
 
 
 @dataclass(frozen=True, slots=True)
