@@ -46,7 +46,13 @@ from valveflow_ros.diagnosis.result import (
     NamedCause,
 )
 from valveflow_ros.diagnosis.screening import Screening
-from valveflow_ros.diagnosis.search import Progress, SearchResult, other_bend, search, simplified
+from valveflow_ros.diagnosis.search import (
+    Progress,
+    SearchResult,
+    search,
+    settle_bend,
+    simplified,
+)
 from valveflow_ros.diagnosis.slow import (
     LEAST_DRIFT_MW,
     NAMED_SHAPE,
@@ -315,7 +321,7 @@ def diagnose(
         start = since.changed
     found = search(task, start, progress, rough)
     progress(0.7, 'the sealed blocks')
-    found.other_bend = other_bend(found)
+    settle_bend(found)
     confirm(found)
     _withdraw_small(found)
     found.model = _dated(found)

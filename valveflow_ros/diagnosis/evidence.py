@@ -330,7 +330,8 @@ def sign_flip(scores: FloatArray) -> float:
 def noise_floor(task: Task, model: Extended, explained_mw2: float) -> float:
     """Return an estimate of the RMSE on the sealed blocks due to noise alone.
 
-    The contributions of parameter errors and of remaining structure are subtracted.
+    The contributions of parameter errors and of remaining structure are subtracted, down to what
+    the rows just before do not predict.
     """
     rows = task.grids.sealed_rows
     columns = np.column_stack([base_tangents(task, model), cause_tangents(task, model)])
@@ -339,11 +340,13 @@ def noise_floor(task: Task, model: Extended, explained_mw2: float) -> float:
     norm[norm <= 1e-9 * norm.max()] = np.inf
     e = task.innovations(task.residual(model))
     inverse = np.linalg.pinv((table / norm).T @ (table / norm), hermitian=True)
-    inverse *= float(e @ e) / len(e)
+    unpredicted = float(e @ e) / len(e)
+    inverse *= unpredicted
     sealed = columns[rows] / norm
     spread = float(np.einsum('ij,jk,ik->i', sealed, inverse, sealed).mean())
-    left = rmse(task, model, rows) ** 2 - spread - max(explained_mw2, 0.0)
-    return float(np.sqrt(max(left, 0.0)))
+    whole = rmse(task, model, rows) ** 2
+    left = whole - spread - max(explained_mw2, 0.0)
+    return float(np.sqrt(max(left, min(unpredicted, whole))))
 
 
 def by_segment(

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,10 +24,13 @@ from valveflow_ros.diagnosis.fitting import (
     settle,
 )
 from valveflow_ros.diagnosis.grids import Grids
+from valveflow_ros.diagnosis.kernels import bump
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.errors import TooFewSamplesError
-from valveflow_ros.fit.problem import Samples
+from valveflow_ros.fit.piece_selection import choose_pieces
+from valveflow_ros.fit.problem import Problem, Samples
 from valveflow_ros.fit.refine import search as search_plain
+from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.records import FloatArray
 
 # The plain simulation: few distinct pieces.
@@ -157,88 +160,155 @@ def _rich(base: RegionalModel) -> RegionalModel:
     """Return the curve with its widest pieces split in two; superfluous ones are removed later."""
     for _ in range(_MORE_PIECES):
         k = int(np.argmax(np.diff(base.knots)))
-        middle = 0.5 * (base.knots[k] + base.knots[k + 1])
-        value = 0.5 * (base.left[k] + base.right[k])
-        base = replace(
-            base,
-            knots=np.insert(base.knots, k + 1, middle),
-            left=np.insert(base.left, k + 1, value),
-            right=np.insert(base.right, k, value),
-        )
+        base = _with_knot(base, 0.5 * float(base.knots[k] + base.knots[k + 1]))
     return base
 
 
-# A bump, or a dent next to it.
+def _with_knot(base: RegionalModel, u: float) -> RegionalModel:
+    """Return the same curve with a further breakpoint at ``u``."""
+    k = int(np.searchsorted(base.knots, u)) - 1
+    value = base.left[k] + base.slopes()[k] * (u - base.knots[k])
+    return replace(
+        base,
+        knots=np.insert(base.knots, k + 1, u),
+        left=np.insert(base.left, k + 1, value),
+        right=np.insert(base.right, k, value),
+    )
+
+
+# A bump, a dent next to it, or neither.
 #
 # With free breakpoints, a curve with a bump is nearly equal to one with other breakpoints and a
-# dent next to it. So a named bend is compared with bends of the other sign, each refitted.
+# dent next to it, or with a bump in place of a breakpoint. So a named bend is compared with such
+# bends, and with breakpoints alone, each beside a newly identified curve.
 
 _BESIDE = (-1.2, -0.7, 0.7, 1.2)  # of its half width
-_SIGN_TOLD = 10.0  # log-likelihood by which one sign must be better than the other
-_LEAST_BEND = 0.1  # of the height of the named one: smaller bends are ignored
+_SHARES = (0.5, 1.0)  # of the height and half width that replace a breakpoint
+_BEND_TOLD = 10.0  # log-likelihood by which one bend must be better than another
+# Of the height of the named one: others are not tried or ignored.
+_LEAST_BEND, _LARGEST_BEND = 0.1, 4.0
 
 
-def other_bend(found: SearchResult) -> Extended | None:
-    """Give `curve_shape` the better sign; return the other model if it fits nearly as well.
+def settle_bend(found: SearchResult) -> None:
+    """Give `curve_shape` the best place and sign; withdraw it where breakpoints do as well.
 
-    Both are fitted in the same way and compared with the whitening of the better one; each
-    parameter of the curve is penalised.
+    ``found.other_bend`` becomes the model with the opposite sign if it fits nearly as well. Two
+    models are compared with the whitening of one; each parameter of the curve is penalised.
     """
     bend = _bend(found.model)
     if bend is None:
-        return None
+        return
+    task = found.task if found.rough is None else replace(found.task, grids=found.rough)
+    anew = [_settled_anew(task, m) for m in _other_bends(found.model, bend)]
+    alike, turned = (
+        [m for m in anew if m and _is_bend(m, bend, turned)] for turned in (False, True)
+    )
+    kept, own = found.model, settle(task, found.model, rounds=2, steps=10)[:2]
+    if alike:
+        best = settle(task, _best(task, kept, alike), rounds=2, steps=10)[:2]
+        better = _advantage(*best, own[1])
+        kept = best[1] if better > _BEND_TOLD else kept
+        own = best if better > 0.0 else own
+    if turned:
+        best = settle(task, _best(task, found.model, turned), rounds=2, steps=10)[:2]
+        better, worse = _advantage(*best, own[1]), _advantage(*own, best[1])
+        if _is_bend(best[1], bend, turned=True) and better > 0.0:
+            kept, found.other_bend = best[1], own[1] if better < _BEND_TOLD else None
+            own = best
+        elif _is_bend(best[1], bend, turned=True) and worse < _BEND_TOLD:
+            found.other_bend = best[1]
+    knots = _settled_anew(task, _in_pieces(own[1]))
+    if knots:
+        _, knots, _ = settle(task, knots, rounds=2, steps=10)
+        # Straight pieces are what a valve is expected to have: any number of them may be needed.
+        gain = _advantage(*own, knots, 0.0) - PENALTY * bend.size
+        if gain < NOT_TOLD_APART:
+            kept, found.other_bend = knots, None
+            found.evidence.pop('curve_shape')
+            found.near.pop('curve_shape')
+            found.reasons['curve_shape'] = 'breakpoints of the curve explain the data as well'
+    if kept is not found.model:
+        found.task, found.model, _ = settle(found.task, kept, rounds=1, steps=6)
+    if 'curve_shape' not in kept.names:
+        found.plain, _ = improve(found.task, replace(found.plain, base=found.model.base), 4)
+
+
+def _in_pieces(model: Extended) -> Extended:
+    """Return the model with straight pieces in place of `curve_shape`."""
+    bend = _bend(model)
+    assert bend is not None
     h, centre, width = bend.values
-    turned = []
+    base = model.base
+    for u in (centre - width, centre, centre + width):
+        if base.knots[0] < u < base.knots[-1] and u not in base.knots:
+            base = _with_knot(base, u)
+    raised = np.empty(len(base.knots))
+    bump(base.knots, centre, width, raised)
+    base = replace(base, left=base.left + h * raised[:-1], right=base.right + h * raised[1:])
+    return replace(model.without('curve_shape'), base=base)
+
+
+def _best(task: Task, model: Extended, tried: list[Extended]) -> Extended:
+    return min(tried, key=lambda other: _advantage(task, model, other))
+
+
+def _other_bends(model: Extended, bend: FittedCause) -> Iterator[Extended]:
+    """Yield the model, with an opposite bend next to its own, and with one at each breakpoint."""
+    h, centre, width = bend.values
+    yield model
     for beside in _BESIDE:
-        model = found.model.having(replace(bend, values=(-h, centre + beside * width, width)))
-        try:
-            tried = _settled_anew(found.task, model)
-        except (TooFewSamplesError, np.linalg.LinAlgError):
-            continue
-        if _turned(tried[1], h):
-            turned.append(tried)
-    if not turned:
-        return None
-    least = min(turned, key=lambda tried: _advantage(found.task, found.model, tried[1]))
-    own_task, own, _ = settle(found.task, found.model, rounds=2, steps=10)
-    task, other, _ = settle(*least, rounds=2, steps=10)
-    if not _turned(other, h):
-        return None
-    better = _advantage(task, other, own)
-    if better > 0.0:
-        found.task, found.model = task, other
-        return own if better < _SIGN_TOLD else None
-    return other if _advantage(own_task, own, other) < _SIGN_TOLD else None
+        yield model.having(replace(bend, values=(-h, centre + beside * width, width)))
+    base = model.base
+    for k in range(1, len(base.knots) - 1):
+        height = _height(base, k)
+        if _LEAST_BEND * abs(h) < abs(height) < _LARGEST_BEND * abs(h):
+            wide = 0.5 * float(base.knots[k + 1] - base.knots[k - 1])
+            for share in _SHARES:
+                values = share * height, float(base.knots[k]), share * wide
+                at_knot = replace(bend, values=values)
+                yield replace(model, base=without_knot(base, k)).having(at_knot)
 
 
-def _advantage(task: Task, model: Extended, other: Extended) -> float:
+def _height(base: RegionalModel, knot: int) -> float:
+    """Return the power at a breakpoint above the line between its neighbours, in MW."""
+    (a, b, c), slopes = base.knots[knot - 1 : knot + 2], base.slopes()
+    return float((slopes[knot - 1] - slopes[knot]) * (b - a) * (c - b) / (c - a))
+
+
+def _advantage(task: Task, model: Extended, other: Extended, each: float = _EACH) -> float:
     """Return the log-likelihood of a model minus that of another, with one whitening."""
     e = task.innovations(task.residual(model))
     variance = float(e @ e) / len(e) * colour(task, e)
     gain = (task.cost(other) - task.cost(model)) / (2.0 * variance)
-    return gain + _EACH * (other.base.size - model.base.size)
+    return gain + each * (other.base.size - model.base.size)
 
 
-def _settled_anew(task: Task, model: Extended) -> tuple[Task, Extended]:
-    """Return the model fitted again with newly identified curve and regions."""
-    if not task.fixed_dynamics:
-        base, _ = search_plain(_seen_through(task, model), _rich(model.base), _MOST)
-        model = replace(model, base=simplified(base))
-    return settle(task, model, rounds=1, steps=6)[:2]
+def _settled_anew(task: Task, model: Extended) -> Extended | None:
+    """Return the model fitted again with newly chosen pieces, and the same regions."""
+    try:
+        if not task.fixed_dynamics:
+            rows = Problem(_seen_through(task, model).coarser())
+            base = choose_pieces(rows, model.base, fit_ar(*rows.answer(model.base)), _MOST).model
+            model = replace(model, base=simplified(base))
+        return settle(task, model, rounds=1, steps=6)[1]
+    except (TooFewSamplesError, np.linalg.LinAlgError):
+        return None
 
 
 def _bend(model: Extended) -> FittedCause | None:
     return next((a for a in model.active if a.name == 'curve_shape'), None)
 
 
-def _turned(model: Extended, h: float) -> bool:
-    """Return True if the bend has the opposite sign to ``h`` and lies on the curve."""
+def _is_bend(model: Extended, named: FittedCause, turned: bool) -> bool:
+    """Return True if the bend lies on the curve and has the sign of the named one, or not."""
     bend = _bend(model)
     if bend is None:
         return False
+    h = named.values[0]
     height, centre = bend.values[:2]
     low, high = model.base.knots[0], model.base.knots[-1]
-    return bool(height * h < 0.0 and abs(height) > _LEAST_BEND * abs(h) and low < centre < high)
+    large = abs(height) > _LEAST_BEND * abs(h)
+    return bool((height * h < 0.0) == turned and large and low < centre < high)
 
 
 Progress = Callable[[float, str], None]
