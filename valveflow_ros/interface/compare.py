@@ -29,7 +29,7 @@ from valveflow_ros.report.comparison_tables import Compared
 from valveflow_ros.report.page import Page
 from valveflow_ros.report.validation import Validated
 from valveflow_ros.report.words import held_words, percent
-from valveflow_ros.signals.static_form import INTEGRATED_INPUT
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -147,8 +147,12 @@ def compare(
     RecordingError, InputError, DataError
         A log cannot be read, determines no curve, or contains no data for the test.
     """
-    # The other two methods are used as in the paper: their input is V p^m.
     given = {**(parameters or {}), 'axis': INTEGRATED_INPUT}
+    if (parameters or {}).get('axis') == OPENING:
+        raise UsageError(
+            'compare uses the form F(V p^m) for all methods, as their papers do: leave the '
+            'parameter axis out.'
+        )
     if truth is not None and not isinstance(truth, Truth):
         truth = models.load_truth(truth)
     log = _not_empty(as_log(log, progress))
@@ -169,7 +173,7 @@ def compare(
         samples_of(learn.task.contents, settings), characteristic,
         other_data(judged.task.contents, other), truth, progress,
     )  # fmt: skip
-    doubt = wrong_form(characteristic)
+    doubt = wrong_form(characteristic, 'is used for all three methods')
     if doubt:
         progress.warn(doubt)
     notes = tuple(n for n in dict.fromkeys((*notes, *more, doubt, *characteristic.notes)) if n)

@@ -24,7 +24,7 @@ from valveflow_ros.records import (
     Readings,
     Signal,
 )
-from valveflow_ros.signals.units import DIFFERENCES, UNITS, air_in, better_units, unit_of
+from valveflow_ros.signals.units import DIFFERENCES, FURTHER, UNITS, air_in, better_units, unit_of
 
 # A pressure must be positive; the temperature is absolute zero.
 _LEAST_MPA, _COLDEST_DEGC = 1e-6, -273.15
@@ -63,13 +63,16 @@ class Doubt:
         if not self.looks_like:
             return self.sentence
         topic = SIGNALS[self.signal].topic
-        chosen = [option(topic, theirs, unit) for unit in (self.looks_like, *self.also)]
+        fitting = self.looks_like, *self.also
+        chosen = [option(topic, theirs, unit) for unit in fitting]
+        gauge = [f'{unit}g' for unit in fitting if f'{unit}g' in FURTHER.get(self.signal, ())]
+        instead = f', with {" or ".join(gauge)} if it is a gauge pressure' if gauge else ''
         if self.other:
             return (
                 f'{self.sentence} Name the right column with --column {topic}={THEIRS}[:unit]; if '
-                f'the unit is wrong, add {" or ".join(chosen)}'
+                f'the unit is wrong, add {" or ".join(chosen)}{instead}'
             )
-        return f'{self.sentence} If so, add {" or ".join(chosen)}'
+        return f'{self.sentence} If so, add {" or ".join(chosen)}{instead}'
 
     def remedy(self, theirs: str) -> Remedy:
         """Return the option that helps, with a placeholder if the column is wrong."""
