@@ -22,6 +22,8 @@ from diagnosis_records import (
 from streams import needs_jit
 
 import valveflow_ros as vf
+from benchmarks.naming.records import Entry
+from benchmarks.naming.records import record as benchmark_record
 from valveflow_ros.diagnosis.diagnose import diagnose
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.unit import Noise, Programme
@@ -159,6 +161,22 @@ def test_a_bump_is_not_called_a_dent(h_mw, seed):
     height = found.causes[0].parameters['h_mw']
     assert height.value * h_mw > 0.0 or height.low * height.high < 0.0
     assert ('equally well' in found.causes[0].sentence) == (height.low * height.high < 0.0)
+
+
+def test_means_of_a_minute_tell_a_bump_from_a_dent_beside_it():
+    plant = vf.simulate(5.0, 12, ['curve_shape:h_mw=3,u0=1425,width_u=140'])
+    frame = plant.to_dataframe().set_index('time').resample('60s').mean().reset_index()
+    (cause,) = vf.diagnose(frame).diagnosis.causes
+    assert cause.parameters['h_mw'].value == pytest.approx(3.0, rel=0.3)
+    assert cause.parameters['u0'].value == pytest.approx(1425.0, abs=30.0)
+
+
+@pytest.mark.long
+def test_a_bend_that_breakpoints_explain_as_well_is_no_cause():
+    entry = Entry(93022, 'paper', 'minute', 'outside', 'two steps')
+    found = vf.diagnose(benchmark_record(entry, 5.0)[0]).diagnosis
+    assert 'curve_shape' not in names(found)
+    assert ('curve_shape', 'breakpoints of the curve explain the data as well') in found.rejected
 
 
 @pytest.mark.parametrize(

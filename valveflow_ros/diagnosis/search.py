@@ -184,6 +184,7 @@ def _with_knot(base: RegionalModel, u: float) -> RegionalModel:
 
 _BESIDE = (-1.2, -0.7, 0.7, 1.2)  # of its half width
 _SHARES = (0.5, 1.0)  # of the height and half width that replace a breakpoint
+_BEND_SIZE = 3  # parameters
 _BEND_TOLD = 10.0  # log-likelihood by which one bend must be better than another
 # Of the height of the named one: others are not tried or ignored.
 _LEAST_BEND, _LARGEST_BEND = 0.1, 4.0
@@ -201,7 +202,8 @@ def settle_bend(found: SearchResult) -> None:
     task = found.task if found.rough is None else replace(found.task, grids=found.rough)
     anew = [_settled_anew(task, m) for m in _other_bends(found.model, bend)]
     alike, turned = (
-        [m for m in anew if m and _is_bend(m, bend, turned)] for turned in (False, True)
+        [m for m in anew if m and _is_bend(m, bend, turned) and not _rounds(m)]
+        for turned in (False, True)
     )
     kept, own = found.model, settle(task, found.model, rounds=2, steps=10)[:2]
     if alike:
@@ -217,20 +219,33 @@ def settle_bend(found: SearchResult) -> None:
             own = best
         elif _is_bend(best[1], bend, turned=True) and worse < _BEND_TOLD:
             found.other_bend = best[1]
-    knots = _settled_anew(task, _in_pieces(own[1]))
-    if knots:
-        _, knots, _ = settle(task, knots, rounds=2, steps=10)
-        # Straight pieces are what a valve is expected to have: any number of them may be needed.
-        gain = _advantage(*own, knots, 0.0) - PENALTY * bend.size
-        if gain < NOT_TOLD_APART:
-            kept, found.other_bend = knots, None
-            found.evidence.pop('curve_shape')
-            found.near.pop('curve_shape')
-            found.reasons['curve_shape'] = 'breakpoints of the curve explain the data as well'
+    knots, why = _in_its_place(task, own, found)
+    if why:
+        kept, found.other_bend = knots, None
+        found.evidence.pop('curve_shape', None)
+        found.near.pop('curve_shape', None)
+        found.reasons['curve_shape'] = why
+    elif _rounds(own[1]):
+        kept, found.other_bend = found.other_bend or kept, None
     if kept is not found.model:
         found.task, found.model, _ = settle(found.task, kept, rounds=1, steps=6)
-    if 'curve_shape' not in kept.names:
+    if why:
         found.plain, _ = improve(found.task, replace(found.plain, base=found.model.base), 4)
+
+
+def _in_its_place(
+    task: Task, own: tuple[Task, Extended], found: SearchResult
+) -> tuple[Extended, str]:
+    """Return the model with breakpoints alone, and why they are to be preferred; '' if not."""
+    model = _in_pieces(own[1])
+    _, knots, _ = settle(task, _settled_anew(task, model) or model, rounds=2, steps=10)
+    # Straight pieces are what a valve is expected to have: any number of them may be needed.
+    gain = _advantage(*own, knots, 0.0) - PENALTY * _BEND_SIZE
+    if gain < NOT_TOLD_APART:
+        return knots, 'breakpoints of the curve explain the data as well'
+    if _rounds(own[1]) and found.other_bend is None:
+        return knots, 'it lies at a breakpoint, as the rounded breakpoint of a healthy valve would'
+    return knots, ''
 
 
 def _in_pieces(model: Extended) -> Extended:
@@ -437,7 +452,7 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
         if best is not None and rival.score - best > NOT_TOLD_APART:
             break
         doubt = (
-            rival.added.beyond or _without_onset(found.task, rival) or _rounded(found.task, rival)
+            rival.added.beyond or _without_onset(found.task, rival) or _small(found.task, rival)
         )
         if doubt:
             # It is no candidate, so it must not hide another one that explains less.
@@ -491,21 +506,23 @@ def _without_onset(task: Task, rival: Rival) -> str:
     return '' if gain > KEPT_LEAST else 'it explains as much without its onset'
 
 
-def _rounded(task: Task, rival: Rival) -> str:
+def _small(task: Task, rival: Rival) -> str:
     """Return why a bend is none: the straight pieces of a healthy valve miss as much; or ''."""
     if rival.added.name != 'curve_shape':
         return ''
-    height, centre, width = rival.added.values
     least = _LEAST_HEIGHT * float(np.max(task.grids.power))
-    if abs(height) <= least:
-        return (
-            f'a healthy valve differs from straight pieces by up to {least:.2g} MW, this by less'
-        )
-    base = rival.model.base
+    if abs(rival.added.values[0]) > least:
+        return ''
+    return f'a healthy valve differs from straight pieces by up to {least:.2g} MW, this by less'
+
+
+def _rounds(model: Extended) -> bool:
+    """Return True if the bend is at a breakpoint, as the rounded one of a healthy valve is."""
+    bend, base = _bend(model), model.base
+    assert bend is not None
+    height, centre, width = bend.values
     turns = np.diff(base.slopes())[np.abs(base.knots[1:-1] - centre) < _AT_KNOT * width]
-    if np.any(turns * height > 0.0):
-        return 'it lies at a breakpoint, as the rounded breakpoint of a healthy valve would'
-    return ''
+    return bool(np.any(turns * height > 0.0))
 
 
 def _as_knots(found: SearchResult, rival: Rival) -> bool:
