@@ -67,7 +67,9 @@ def read_truth(raw: object) -> Truth:
         It is neither; the message names the place.
     """
     if not isinstance(raw, dict) or not isinstance(raw.get('pieces'), list) or not raw['pieces']:
-        raise DataError("This is no truth of a plant of the paper's kind: it must hold a list 'pieces'.")
+        raise DataError(
+            "This is no truth of a plant of the paper's kind: it must hold a list 'pieces'."
+        )
     top = checked(raw, _SCHEMA, 'truth')
     check_pieces(top['pieces'], 'truth', 'pieces', Joint.NEARLY)
     table = np.array([list(piece.values()) for piece in top['pieces']])

@@ -250,7 +250,9 @@ def _curve_facts(found: Identification, task: FleetTask) -> Row:
     settings = data.settings
     limits = ShiftLimits(settings.real('shift_confidence'), settings.real('shift_least'))
     try:
-        change = judge_shift(first, c, found.segments, limits)
+        # A compressed log dates nothing, as in `identify`.
+        segments = () if found.log.compression else found.segments
+        change = judge_shift(first, c, segments, limits)
     except DataError as error:
         row['notes'].append(f'Against the first curve of the unit: {error}')
         return row
