@@ -346,7 +346,7 @@ def test_a_cause_in_doubt_hides_no_other(
     monkeypatch.setattr(search, '_rivals', lambda *_: rivals)
     monkeypatch.setattr(search, '_visible', lambda found, rivals, barred: rivals)
     monkeypatch.setattr(search, '_without_onset', lambda *_: '')
-    monkeypatch.setattr(search, '_rounded', doubt)
+    monkeypatch.setattr(search, '_small', doubt)
     monkeypatch.setattr(search, 'weigh', weigh)
     assert not _add(SearchResult(None, model, model), set())  # type: ignore[arg-type]
     assert seen == weighed

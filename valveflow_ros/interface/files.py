@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.signals.units import in_unit
 
 if TYPE_CHECKING:
     from valveflow_ros.logs import LogContents
@@ -233,6 +232,8 @@ class Result:
 
     def __repr__(self) -> str:
         """Return what was found; all the data would fill pages of a notebook."""
+        from valveflow_ros.signals.units import in_unit
+
         return f'<{type(self).__name__}: {in_unit(self._sentence(), self.output_unit)}>'
 
     def _sentence(self) -> str:
@@ -264,6 +265,8 @@ class Result:
 
     def _told(self) -> dict[str, str]:
         """Return the files with their sentences in the unit of the output; models have none."""
+        from valveflow_ros.signals.units import in_unit
+
         return {
             name: content if name.endswith('_model.json') else in_unit(content, self.output_unit)
             for name, content in self.texts().items()
