@@ -219,7 +219,7 @@ def settle_bend(found: SearchResult) -> None:
             own = best
         elif _is_bend(best[1], bend, turned=True) and worse < _BEND_TOLD:
             found.other_bend = best[1]
-    knots, why = _in_its_place(task, own, found)
+    knots, why = _without_bend(task, own, found)
     if why:
         kept, found.other_bend = knots, None
         found.evidence.pop('curve_shape', None)
@@ -233,10 +233,10 @@ def settle_bend(found: SearchResult) -> None:
         found.plain, _ = improve(found.task, replace(found.plain, base=found.model.base), 4)
 
 
-def _in_its_place(
+def _without_bend(
     task: Task, own: tuple[Task, Extended], found: SearchResult
 ) -> tuple[Extended, str]:
-    """Return the model with breakpoints alone, and why they are to be preferred; '' if not."""
+    """Return the model with breakpoints alone, and why it is preferred to the bend; or ''."""
     model = _in_pieces(own[1])
     _, knots, _ = settle(task, _settled_anew(task, model) or model, rounds=2, steps=10)
     # Straight pieces are what a valve is expected to have: any number of them may be needed.
@@ -285,7 +285,7 @@ def _other_bends(model: Extended, bend: FittedCause) -> Iterator[Extended]:
 
 
 def _height(base: RegionalModel, knot: int) -> float:
-    """Return the power at a breakpoint above the line between its neighbours, in MW."""
+    """Return how far the curve at a breakpoint is above the line between its neighbours, in MW."""
     (a, b, c), slopes = base.knots[knot - 1 : knot + 2], base.slopes()
     return float((slopes[knot - 1] - slopes[knot]) * (b - a) * (c - b) / (c - a))
 

@@ -33,8 +33,8 @@ _MEAN_S = 60.0
 _KNOTS = 10
 _FOLDS, _STRETCHES = 5, 40
 # Half a day has 50 to 250 of them. Fixed on half-days of units built from physics, numbers 301 to
-# 308 of each kind, and of plants of the paper's kind, 401 to 420: the form was right in 41 of 44
-# and "cannot be decided" in 3.
+# 308 of each kind, and of plants of the paper's kind, 401 to 420: the form was right in 40 of 44
+# and "cannot be decided" in 4.
 _LEAST_MEANS = 40
 _MOST_MEANS = 6000
 # Each grid covers the neighbourhood of the best value of the previous grid. The likelihood is not
