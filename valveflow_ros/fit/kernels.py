@@ -359,7 +359,8 @@ def tangents(
             kept, last, now = decay[i], table[i], table[i + 1]
             for p in range(columns):
                 now[p] += kept * last[p]
-        table[0] = table[n]
+        for p in range(columns):  # a whole row at once takes numba seconds more to compile
+            table[0, p] = table[n, p]
         for k in range(max(0, first - mean), n // group):
             good, place = settled[k] == 1, mean + k - first
             weight[place] = 1 if good else 0
