@@ -194,8 +194,8 @@ def clock_starts(screening: Screening) -> Sequence[Start]:
 def clock_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
-        f'The power answers before the valve moves: its time stamps are at least '
-        f'{values["d_s"]:.2g} s early against those of the opening.'
+        f'The power answers before the valve moves: its time stamps are about '
+        f'{values["d_s"]:.2g} s early against those of the opening, more if the unit has a delay.'
     )
 
 
