@@ -16,7 +16,7 @@ from valveflow_ros.diagnosis.cause import Cause, FittedCause, Kind, Stage, Value
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.grids import ORDER, Grids
 from valveflow_ros.fit.descent import descend, gauss_newton
-from valveflow_ros.fit.problem import free_parameters, with_level_moved
+from valveflow_ros.fit.problem import free_parameters, with_level_moved, within_bounds
 from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.numerics import cores, jit, run_in_threads
 from valveflow_ros.records import BoolArray, FloatArray
@@ -344,16 +344,14 @@ def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
     free = np.flatnonzero(base_mask(task, model))
     packed = model.base.pack()
     packed[free] += step[: len(free)]
-    delays = model.base.delay_places
-    lags = slice(delays.start - model.base.regions, delays.start)
-    packed[delays] = np.clip(packed[delays], 0.0, 600.0)
-    packed[lags] = np.clip(packed[lags], np.log(0.1 * task.grids.step_s), np.log(3600.0))
+    base = within_bounds(model.base, packed, task.grids.step_s)
+    if base is None:
+        return None
     scale = float(np.median(task.grids.scale))
-    moved = replace(model, base=levels_along(model.base, model.base.unpack(packed), scale))
+    moved = replace(model, base=levels_along(model.base, base, scale))
     for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):
         moved = _shifted(moved, c, k, float(by))
-    knots = moved.base.knots
-    return moved if np.all(np.diff(knots) > 0.004 * (knots[-1] - knots[0])) else None
+    return moved
 
 
 def improve(

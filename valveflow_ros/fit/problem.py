@@ -30,6 +30,9 @@ _FEW = 4
 # Rows are taken as held by a historian if more than this part of them repeats the row before.
 # A measured power hardly ever repeats by chance.
 _HELD_SHARE = 0.3
+# A shorter lag, as a fraction of the time between rows, does not show in them.
+LEAST_LAG, _LONGEST_LAG_S, _LONGEST_DELAY_S = 0.1, 3600.0, 600.0
+_CLOSEST_KNOTS = 0.004  # of their range
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
@@ -290,16 +293,18 @@ def free_parameters(model: RegionalModel, jumps: BoolArray | None = None) -> Boo
     return free
 
 
-def in_bounds(model: RegionalModel, samples: Samples) -> bool:
-    """Return True if a model is physically possible and the filter can run it."""
-    span = model.knots[-1] - model.knots[0]
-    return bool(
-        np.all(np.diff(model.knots) > 0.004 * span)
-        and np.all(model.time_constants >= 0.1 * samples.step_s)
-        and np.all(model.time_constants <= 3600.0)
-        and np.all(model.delays >= 0.0)
-        and np.all(model.delays <= 600.0)
-    )
+def within_bounds(model: RegionalModel, packed: FloatArray, step_s: float) -> RegionalModel | None:
+    """Return the model of packed parameters, its dynamics moved to what the rows can show.
+
+    None if two breakpoints are too close.
+    """
+    packed, first = packed.copy(), model.dynamic_places.start
+    lags, delays = slice(first, first + model.regions), model.delay_places
+    packed[lags] = np.clip(packed[lags], np.log(LEAST_LAG * step_s), np.log(_LONGEST_LAG_S))
+    packed[delays] = np.clip(packed[delays], 0.0, _LONGEST_DELAY_S)
+    found = model.unpack(packed)
+    span = found.knots[-1] - found.knots[0]
+    return found if np.all(np.diff(found.knots) > _CLOSEST_KNOTS * span) else None
 
 
 def move(
@@ -314,9 +319,7 @@ def move(
     def shifted(model: RegionalModel, step: FloatArray) -> RegionalModel | None:
         packed = model.pack()
         packed[free] += step
-        packed[model.delay_places] = np.maximum(packed[model.delay_places], 0.0)
-        trial = model.unpack(packed)
-        return trial if in_bounds(trial, problem.samples) else None
+        return within_bounds(model, packed, problem.samples.step_s)
 
     return gauss_newton(model, lambda m: problem.cost(m, ar), equations, shifted, steps)
 

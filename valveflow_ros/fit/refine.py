@@ -30,12 +30,13 @@ from valveflow_ros.fit.piece_selection import (
     supported_jumps,
 )
 from valveflow_ros.fit.problem import (
+    LEAST_LAG,
     Problem,
     Samples,
     free_parameters,
-    in_bounds,
     move,
     search_levels,
+    within_bounds,
 )
 from valveflow_ros.fit.uncertainty import covariance_of
 from valveflow_ros.fit.whitening import ORDER, fit_ar
@@ -101,10 +102,8 @@ def corrected(
         return model
     problem_with_errors = Problem(replace(again, group=problem.samples.group))
     moved, _ = move(problem_with_errors, model, ar, free, 2)
-    packed = 2.0 * model.pack() - moved.pack()
-    packed[model.delay_places] = np.maximum(packed[model.delay_places], 0.0)
-    trial = model.unpack(packed)
-    return trial if in_bounds(trial, problem.samples) else model
+    trial = within_bounds(model, 2.0 * model.pack() - moved.pack(), problem.samples.step_s)
+    return model if trial is None else trial
 
 
 def _noisier(samples: Samples) -> Samples | None:
@@ -144,7 +143,8 @@ def _first_regions(problem: Problem, model: RegionalModel) -> list[RegionalModel
     of squares is minimal if each range of flow has its own best pair. The
     filter's memory across a level is neglected here.
     """
-    pairs = [(t, d) for t in _GRID_T_S for d in _GRID_DELAY_S if d <= t]
+    shortest = LEAST_LAG * problem.samples.step_s
+    pairs = [(max(t, shortest), d) for t in _GRID_T_S for d in _GRID_DELAY_S if d <= t]
     flow = model.static(np.where(problem.usable > 0, problem.u, np.nan), problem.scale)
     flow = flow.reshape(-1, problem.samples.group).mean(axis=1)
     squares = []
@@ -501,8 +501,8 @@ def _with_exponent(
         share = (trial - by) / step[-1]
         change = share * step[: model.size]
         change[model.dynamic_places] = 0.0
-        moved = model.unpack(model.pack() + change)
-        model = rows.model_with_exponent(moved if in_bounds(moved, rows) else model, trial - by)
+        moved = within_bounds(model, model.pack() + change, rows.step_s)
+        model = rows.model_with_exponent(model if moved is None else moved, trial - by)
         model, _ = move(Problem(rows.with_exponent(trial)), model, ar, free, 3)
         by = trial
     return None if kept and not abs(by) > _EXPONENT_Z * error else (model, by)
@@ -519,8 +519,8 @@ def _without_hold(
     other, bias = found
     by = float(np.clip(-bias, *within))
     other = rows.model_with_exponent(other, -bias)
-    trial = model.unpack(2.0 * model.pack() - other.pack())
-    if not in_bounds(trial, rows):
+    trial = within_bounds(model, 2.0 * model.pack() - other.pack(), rows.step_s)
+    if trial is None:
         return model, moved
     return rows.model_with_exponent(trial, by), moved + by
 
