@@ -152,6 +152,19 @@ def test_a_start_with_a_narrow_piece_moves_all_the_same():
     assert np.abs(deviations(result)).max() < 4.5
 
 
+def test_a_plant_faster_than_its_rows_show_has_the_right_curve_all_the_same():
+    fast = replace(TRUE, levels=np.empty(0), time_constants=np.array([2.0]), delays=np.zeros(1))
+    rng = np.random.default_rng(4)
+    u = steps_and_ramps(rng, 4000, 1000.0, 2000.0, hold=(60, 200), rate=3.0)
+    usable = np.ones(len(u), dtype=np.uint8)
+    power, _ = fast.respond(u, usable, 60.0, 0.0)
+    power += rng.normal(0.0, 0.3, len(u))
+    result = refine(Samples(u, power, usable, step_s=60.0, settle_s=110.0, group=1), START)
+    at = np.linspace(1000.0, 2000.0, 101)
+    assert np.abs(result.model.static(at) - fast.static(at)).max() < 0.3
+    assert result.model.time_constants <= 6.0  # what rows a minute apart cannot tell from 2 s
+
+
 def test_no_jump_is_found_where_there_is_none():
     assert not refined(0).free[2 * 3 : 2 * 3 + 2].any()
 
