@@ -99,7 +99,7 @@ def gain_drift_sentence(values: dict[str, float]) -> str:
     """Return the sentence for the operator."""
     return (
         f'The power at the same flow changes evenly: {change(values["g"])} per ten days, at '
-        'every load (wear, efficiency, or the scale of the power meter).'
+        'every load (wear, efficiency, the scale of the power meter, or the weather).'
     )
 
 

@@ -407,11 +407,15 @@ def _concluded(
             'The process value does not follow the command: check that both are of one loop.',
         )
     if not regular and turns < 2.0 * LEAST_PERIODS - 1.0:
+        shown = (
+            "Horch's cross-correlation suspects sticking"
+            if horch.answer == STICTION
+            else 'No fault of the valve shows'
+        )
         return NOT_JUDGED, (
             f'The command had {counted(turns, "reversal")} of {100.0 * _TURN:.0f} % of its range '
             f'or more; {2.0 * LEAST_PERIODS - 1.0:.0f} are needed ({LEAST_PERIODS:.0f} full '
-            'swings). No fault of the valve shows, but so few reversals do not prove that it is '
-            'sound: take a longer record.'
+            f'swings). {shown}, but so few reversals prove nothing: take a longer record.'
         )
     if regular:
         return OSCILLATING, (
