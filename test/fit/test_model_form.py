@@ -203,6 +203,12 @@ def test_what_a_curve_gets_wrong_is_told_with_its_place(seed) -> None:
     assert opening > 60.0
     assert pressure > 14.0
     assert most == pytest.approx(-12.0, abs=3.0)
+    # Small in the mean of all rows, large at one place.
+    low, high = np.quantile(v, (0.68, 0.82))
+    here = right + np.where((v > low) & (v < high) & (p > np.median(p)), 10.0, 0.0)
+    found = find_misfit(v, p, y - here, y, spans, PERIOD_S)
+    assert found is not None
+    assert low < found.worst[0] < high
     # What comes once and never again is no fault of the curve.
     once = np.where(np.arange(len(y)) < 400, 15.0, 0.0)
     assert find_misfit(v, p, y - right + once, y, spans, PERIOD_S) is None

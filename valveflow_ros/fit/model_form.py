@@ -54,7 +54,7 @@ _LIKELIER_Z = 1.5
 _CHOKED_EXPONENT = 1.0
 _WORST = 0.05
 _LEAST_IN_CELL, _EIGHTHS = 5, 8
-_MISFIT = 0.01  # of the power's range
+_MISFIT, _MISFIT_OF_CELL = 0.01, 0.025  # of the power's range
 _PROFILE_MEANS, _PROFILE_PIECES = 1500, 6
 
 
@@ -224,7 +224,9 @@ def find_misfit(
     spans: IntArray,
     period_s: float,
 ) -> Misfit | None:
-    """Return the repeated error of a curve, None if it is below 1 % of the range of the power.
+    """Return the repeated error of a curve; None if it is small.
+
+    It is small below 1 % of the range of the power in the mean, and below 2.5 % in each cell.
 
     Parameters
     ----------
@@ -257,9 +259,9 @@ def find_misfit(
         return None
     common = m1 * m2
     rms = math.sqrt(max(0.0, float((n * common).sum() / n.sum())))
-    if not rms > _MISFIT * float(np.ptp(ramp.power)):
+    worst, extent = int(np.argmax(np.where(n > 0, common, -np.inf))), float(np.ptp(ramp.power))
+    if not (rms > _MISFIT * extent or common[worst] > (_MISFIT_OF_CELL * extent) ** 2):
         return None
-    worst = int(np.argmax(np.where(n > 0, common, -np.inf)))
     there = cell == worst
     return Misfit(rms, (
         float(np.median(means.opening[there])), float(np.median(means.pressure[there])),
