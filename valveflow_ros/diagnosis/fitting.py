@@ -339,14 +339,12 @@ def levels_along(before: RegionalModel, after: RegionalModel, scale: float = 1.0
     return after.with_levels(levels) if np.all(np.diff(levels) > 0.0) else after
 
 
-def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended | None:
-    """Return the model after a step, within bounds; None if breakpoints come too close."""
+def _stepped(task: Task, model: Extended, step: FloatArray) -> Extended:
+    """Return the model after a step, within bounds."""
     free = np.flatnonzero(base_mask(task, model))
     packed = model.base.pack()
     packed[free] += step[: len(free)]
     base = within_bounds(model.base, packed, task.grids.step_s)
-    if base is None:
-        return None
     scale = float(np.median(task.grids.scale))
     moved = replace(model, base=levels_along(model.base, base, scale))
     for (c, k), by in zip(_slots(model), step[len(free) :], strict=True):

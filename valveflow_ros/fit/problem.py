@@ -293,18 +293,21 @@ def free_parameters(model: RegionalModel, jumps: BoolArray | None = None) -> Boo
     return free
 
 
-def within_bounds(model: RegionalModel, packed: FloatArray, step_s: float) -> RegionalModel | None:
-    """Return the model of packed parameters, its dynamics moved to what the rows can show.
+def within_bounds(model: RegionalModel, packed: FloatArray, step_s: float) -> RegionalModel:
+    """Return the model of packed parameters, with all of them moved to where they have a meaning.
 
-    None if two breakpoints are too close.
+    Lags and delays become such as rows ``step_s`` apart can show; breakpoints stay apart.
     """
     packed, first = packed.copy(), model.dynamic_places.start
     lags, delays = slice(first, first + model.regions), model.delay_places
     packed[lags] = np.clip(packed[lags], np.log(LEAST_LAG * step_s), np.log(_LONGEST_LAG_S))
     packed[delays] = np.clip(packed[delays], 0.0, _LONGEST_DELAY_S)
     found = model.unpack(packed)
-    span = found.knots[-1] - found.knots[0]
-    return found if np.all(np.diff(found.knots) > _CLOSEST_KNOTS * span) else None
+    knots = found.knots
+    # Each breakpoint keeps room for those on both sides.
+    room = _CLOSEST_KNOTS * (knots[-1] - knots[0]) * np.arange(len(knots))
+    spread = np.maximum.accumulate(knots - room)
+    return replace(found, knots=np.minimum(spread, knots[-1] - room[-1]) + room)
 
 
 def move(
@@ -316,7 +319,7 @@ def move(
         sums, _ = problem.normal(model, ar)
         return sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
 
-    def shifted(model: RegionalModel, step: FloatArray) -> RegionalModel | None:
+    def shifted(model: RegionalModel, step: FloatArray) -> RegionalModel:
         packed = model.pack()
         packed[free] += step
         return within_bounds(model, packed, problem.samples.step_s)

@@ -95,15 +95,14 @@ def corrected(
 ) -> RegionalModel:
     """Remove the bias due to errors of the input; ``model`` has converged on ``problem``.
 
-    The extrapolation is linear. If its result is out of bounds, the model is returned unchanged.
+    The extrapolation is linear.
     """
     again = samples.simulated(model) if samples.held else _noisier(samples)
     if again is None:
         return model
     problem_with_errors = Problem(replace(again, group=problem.samples.group))
     moved, _ = move(problem_with_errors, model, ar, free, 2)
-    trial = within_bounds(model, 2.0 * model.pack() - moved.pack(), problem.samples.step_s)
-    return model if trial is None else trial
+    return within_bounds(model, 2.0 * model.pack() - moved.pack(), problem.samples.step_s)
 
 
 def _noisier(samples: Samples) -> Samples | None:
@@ -502,7 +501,7 @@ def _with_exponent(
         change = share * step[: model.size]
         change[model.dynamic_places] = 0.0
         moved = within_bounds(model, model.pack() + change, rows.step_s)
-        model = rows.model_with_exponent(model if moved is None else moved, trial - by)
+        model = rows.model_with_exponent(moved, trial - by)
         model, _ = move(Problem(rows.with_exponent(trial)), model, ar, free, 3)
         by = trial
     return None if kept and not abs(by) > _EXPONENT_Z * error else (model, by)
@@ -520,8 +519,6 @@ def _without_hold(
     by = float(np.clip(-bias, *within))
     other = rows.model_with_exponent(other, -bias)
     trial = within_bounds(model, 2.0 * model.pack() - other.pack(), rows.step_s)
-    if trial is None:
-        return model, moved
     return rows.model_with_exponent(trial, by), moved + by
 
 
