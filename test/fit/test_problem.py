@@ -15,7 +15,7 @@ from streams import examples
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit import problem as module
 from valveflow_ros.fit import whitening
-from valveflow_ros.fit.problem import Problem, Samples
+from valveflow_ros.fit.problem import Problem, Samples, within_bounds
 from valveflow_ros.fit.uncertainty import covariance_of
 from valveflow_ros.fit.whitening import normal_equations
 
@@ -256,3 +256,18 @@ def test_the_error_of_the_prediction_is_that_of_the_final_fit_only():
     ]
     assert errors[0] > 0.0
     assert np.isnan(errors[1])
+
+
+@given(seeds)
+@examples(40)
+def test_any_parameters_become_a_model_that_can_be_run(seed):
+    rng = np.random.default_rng(seed)
+    _, model = plant(rng)
+    wild = model.pack() * rng.normal(1.0, 3.0, model.size)
+    found = within_bounds(model, wild, 60.0)
+    assert np.diff(found.knots).min() > 0.0039 * 600.0
+    assert found.knots[[0, -1]].tolist() == [300.0, 900.0]
+    assert np.all((found.time_constants >= 5.999) & (found.time_constants <= 3601.0))
+    assert np.all((found.delays >= 0.0) & (found.delays <= 600.0))
+    again = within_bounds(model, found.pack(), 60.0)
+    assert again.pack() == pytest.approx(found.pack(), rel=1e-12)
