@@ -23,7 +23,15 @@ from valveflow_ros.interface.files import check_results
 from valveflow_ros.report import drawing, first_run
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.drawing import figure_files
-from valveflow_ros.report.figure import Figure, figure_csv, numbers, packed, plain_text
+from valveflow_ros.report.figure import (
+    Figure,
+    figure_csv,
+    numbers,
+    packed,
+    plain_text,
+    points,
+    time_axis,
+)
 from valveflow_ros.report.identification import identification_page
 
 
@@ -52,6 +60,17 @@ def test_a_picture_becomes_png_and_svg_the_same_each_time(figures, name):
     assert plain_text(re.match(r'<b>(.*?)</b>', figures[name].caption).group(1)) in about
     if name == 'alarms':
         assert figure_files(figures[name]) == files
+
+
+@pytest.mark.parametrize('days', [0.3, 1.0, 1.99, 5.0, 59.0, 400.0])
+def test_half_a_picture_has_room_for_its_times(days):
+    pytest.importorskip('matplotlib')
+    at = START_NS / 1e6 + 86400e3 * days * np.linspace(0.0, 1.0, 9)
+    layout = {'xaxis': time_axis(domain=[0.0, 0.47], nticks=4)}
+    drawn = figure_files(
+        Figure('half', '', '', [points(packed(at), at.tolist(), '', 'data')], layout)
+    )
+    assert 2 <= drawn['half.svg'].count(b'"xtick_') <= 5
 
 
 def test_without_matplotlib_one_sentence_says_what_to_do(figures, monkeypatch):

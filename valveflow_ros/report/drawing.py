@@ -171,7 +171,9 @@ def _prepare(pane: Any, figure: Figure, trace: Spec, grid_colour: Any) -> None:
     pane.set_axisbelow(True)
     pane.spines[['top', 'right']].set_visible(False)
     if is_date(across):
-        places = dates.AutoDateLocator()  # type: ignore[no-untyped-call]
+        # Half a figure has room for half the times.
+        some = {'minticks': 2, 'maxticks': across['nticks'] + 1} if 'nticks' in across else {}
+        places = dates.AutoDateLocator(**some)  # type: ignore[no-untyped-call]
         pane.xaxis.set_major_locator(places)
         form = dates.ConciseDateFormatter(places)  # type: ignore[no-untyped-call]
         pane.xaxis.set_major_formatter(form)
