@@ -26,7 +26,12 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.records import SegmentKind, Signal
 from valveflow_ros.report import page
 from valveflow_ros.report.answer import confidence_table, doubt, gain_by_load
-from valveflow_ros.report.curve import segments_figure, shift_section, surface_figure
+from valveflow_ros.report.curve import (
+    opening_figure,
+    segments_figure,
+    shift_section,
+    surface_figure,
+)
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.figure import Figure, time_axis, upright
 from valveflow_ros.report.identification import identification_page, identification_report
@@ -105,6 +110,19 @@ def test_gain_by_load_is_the_slope_of_the_power_over_the_opening(identified, for
     values = data.table.values.copy()
     values[:, Signal.GENERATED_POWER] = 200.0
     assert gain_by_load(replace(data, table=replace(data.table, values=values))) == []
+
+
+def test_power_over_opening_ends_where_the_openings_of_each_pressure_end(identified):
+    values = identified.table.values.copy()
+    u, v = identified.u, values[:, Signal.VALVE_OPENING]
+    values[:, Signal.MAIN_STEAM_PRESSURE] = p = np.where(u < 1000.0, 10.0, 14.0)
+    values[:, Signal.VALVE_OPENING] = v = u / p**1.125
+    data = replace(identified, table=replace(identified.table, values=values))
+    for trace, low in zip(opening_figure(data).traces, (False, False, True), strict=True):
+        seen = v[data.special][(p[data.special] == 10.0) == low]
+        assert np.nanquantile(np.array(trace['x']), (0.0, 1.0)) == pytest.approx(
+            [seen.min(), seen.max()], abs=0.01
+        )
 
 
 def test_pictures_hold_the_curve_the_segments_and_the_choice(report, identified):

@@ -102,9 +102,9 @@ def opening_figure(data: Identified) -> Figure | None:
     known = np.isfinite(opening) & (pressure > 0.0)
     if not known.any() or data.one_pressure:
         return None
-    low, middle, high = np.quantile(pressure[known], (0.05, 0.5, 0.95)).tolist()
+    opening, pressure = opening[known], pressure[known]
+    low, middle, high = np.quantile(pressure, (0.05, 0.5, 0.95), method='nearest').tolist()
     wide = high - low > _SAME_PRESSURE * middle
-    v = np.linspace(float(opening[known].min()), float(opening[known].max()), _OPENINGS)
     traces = [
         plot.line(
             plot.rounded(v), plot.rounded(data.characteristic.power(v, p)), f'at {p:.3g} MPa',
@@ -115,11 +115,14 @@ def opening_figure(data: Identified) -> Figure | None:
             (high, 'chosen', 'dot'), (middle, 'curve', ''), (low, 'raw', 'dash')
         )
         if p == middle or wide
+        for seen in (opening[np.abs(pressure - p) <= _SAME_PRESSURE * p],)
+        for v in (np.linspace(float(seen.min()), float(seen.max()), _OPENINGS),)
     ]  # fmt: skip
     caption = (
         '<b>Power against opening.</b> The same curve against the opening of '
         f'the valve, at the median pressure of the record, {middle:.3g} MPa'
         + (', and at its 5 % and 95 % quantiles.' if wide else '.')
+        + ' Each line ends with the openings seen at its pressure, within 2 %.'
     )
     words = f'Power against the valve opening at {middle:.3g} MPa.'
     layout = {'xaxis': plot.axis('valve opening (%)'), 'yaxis': plot.axis('generated power (MW)')}
