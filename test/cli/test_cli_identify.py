@@ -239,6 +239,8 @@ def test_a_curve_is_judged_against_a_reference(run, logs, quick, tmp_path):
     again = run(*words, folder)
     assert again.status == 0, again.err
     assert 'Against the reference: The curve agrees with the reference of 2023-11-15' in again.out
+    tables = [line for line in again.out.splitlines() if line.startswith('  ')]
+    assert max(map(len, tables)) <= 80, 'a usual terminal'
     shift = json.loads((tmp_path / 'b' / 'shift.json').read_text())
     assert (shift['format'], shift['moved']) == ('valveflow/shift', False)
     assert shift['reference_model_id'] == shift['model_id'] == first.json['model_id']

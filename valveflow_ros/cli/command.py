@@ -13,7 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone, tzinfo
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from valveflow_ros.errors import UsageError
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.logs import Log
     from valveflow_ros.interface.mapping import LogMapping
 
+_TERMINAL = 80  # characters; a wider table has its head in several lines
 # Terminal control characters and those that change the text direction, except tabs and newlines.
 _COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
 
@@ -417,14 +420,27 @@ def lines(*parts: str) -> str:
 
 
 def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str = '  ') -> str:
-    """Return rows with aligned columns; the first column left, the others right."""
+    """Return rows with aligned columns; the first column left, the others right.
+
+    If they are wider than a usual terminal, the head is broken into several lines.
+    """
     everything = [head, *rows] if head else rows
-    first, *others = (max(map(len, column)) for column in zip(*everything, strict=True))
+    if head and rows and len(indent) + sum(w + 2 for w in _widths(everything)) > _TERMINAL:
+        parts = (
+            wrap(name, max(width, 1, *map(len, name.split())))[::-1]
+            for name, width in zip(head, _widths(rows), strict=True)
+        )
+        everything = [*[*zip_longest(*parts, fillvalue='')][::-1], *rows]
+    first, *others = _widths(everything)
     told = []
     for row in everything:
         cells = [row[0].ljust(first), *map(str.rjust, row[1:], others)]
         told.append((indent + '  '.join(cells)).rstrip())
     return '\n'.join(told)
+
+
+def _widths(rows: Sequence[Sequence[str]]) -> list[int]:
+    return [max(map(len, column)) for column in zip(*rows, strict=True)]
 
 
 def table(rows: Sequence[Sequence[str]], head: Sequence[str]) -> str:
