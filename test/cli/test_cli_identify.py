@@ -241,6 +241,8 @@ def test_a_curve_is_judged_against_a_reference(run, logs, quick, tmp_path):
     assert 'Against the reference: The curve agrees with the reference of 2023-11-15' in again.out
     tables = [line for line in again.out.splitlines() if line.startswith('  ')]
     assert max(map(len, tables)) <= 80, 'a usual terminal'
+    now, then, change = re.split(r'  +', tables[-1])[2:]
+    assert (now, change.split()[0]) == (then, '0.0')
     shift = json.loads((tmp_path / 'b' / 'shift.json').read_text())
     assert (shift['format'], shift['moved']) == ('valveflow/shift', False)
     assert shift['reference_model_id'] == shift['model_id'] == first.json['model_id']

@@ -304,7 +304,11 @@ def test_the_judgement_against_a_reference_stands_on_the_page(judged, by_mw, mov
     assert data.shift.sentence.split('(')[0] in html
     lines = {t['name']: t for t in figures_of(html)['curve']['data']}
     assert lines['reference']['y'][0] == lines['flow characteristic']['y'][0] + by_mw
-    lead, table, figure = shift_section(data).parts
+    lead, loads, table, figure = shift_section(data).parts
+    cells = [re.findall(r'<t[hd][^>]*>([^<]*)', row) for row in loads.split('<tr>')[2:]]
+    assert float(cells[-1][0]) == pytest.approx(np.nanquantile(data.static_mw, 0.99), abs=1.0)
+    for _, now, then, change in cells:
+        assert (now, float(change.split()[0].replace('−', '-'))) == (then, -by_mw)
     assert ('class="notice"' in lead) is moved
     assert table.count('<b>yes</b>') == 2 * moved
     points = np.concatenate([np.array(t['y'], float) for t in figure.traces])
@@ -322,7 +326,7 @@ def test_a_dated_change_is_marked_and_a_piece_that_the_reference_lacks_is_said(j
         pieces=(replace(first, now_mw=-6.0, now_error_mw=0.3),
                 replace(second, u_from=nan, u_to=nan, middle_mw=nan)),
     )  # fmt: skip
-    _, table, figure = shift_section(replace(data, shift=dated)).parts
+    *_, table, figure = shift_section(replace(data, shift=dated)).parts
     assert '−6.0' in table
     assert 'not in the reference' in table
     assert [s['type'] for s in figure.layout['shapes']] == ['line', 'rect', 'line']

@@ -125,6 +125,7 @@ def form_words(data: Identified) -> str:
 _LOADS = 50.0, 20.0, 10.0, 5.0  # steps of the table by load, MW
 _NEAR = 0.02  # of the range of the power: rows at a load
 _LEAST_ROWS = 20
+_LARGEST = 0.99  # quantile of the power that is called the largest load
 _SMALL_MPA = 2.0  # below it, as of a pressure difference, one decimal would hide the change
 _PRESSURES = 41  # between the ends of the pressures at a load
 
@@ -152,7 +153,7 @@ def _at_loads(data: Identified) -> Iterator[tuple[float, FloatArray, FloatArray]
     wanted = [Signal.GENERATED_POWER, Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]
     rows = data.table.values[:, wanted]
     power, opening, pressure = rows[np.isfinite(rows).all(axis=1)].T
-    low, high = np.quantile(power, (0.01, 0.99)).tolist() if len(power) else (0.0, 0.0)
+    low, high = np.quantile(power, (0.01, _LARGEST)).tolist() if len(power) else (0.0, 0.0)
     if not high > low:
         return
     step = next((s for s in _LOADS if high - low > 4.0 * s), (high - low) / 4.0)
@@ -222,6 +223,46 @@ def gain_table(data: Identified) -> str:
             'of the pressure holds for nine tenths of the time at this load; it is wide if the '
             'unit at times keeps a higher pressure.'
         )
+    return html.table(head, cells, caption=caption) if cells else ''
+
+
+def reference_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
+    """Return head and cells of the curve against the reference by load, the largest load last.
+
+    Both curves are read at the same opening and pressure; there are no cells without a reference.
+    """
+    c, r, shift = data.characteristic, data.reference, data.shift
+    head = ['load (MW)', 'MW per 1 % of opening', 'in the reference', 'change of the power (MW)']
+    if r is None or shift is None:
+        return head, []
+    at = np.array([(g.opening, g.pressure) for g in gain_by_load(data)]).reshape(-1, 2)
+    rows = data.table.values[:, [Signal.VALVE_OPENING, Signal.MAIN_STEAM_PRESSURE]]
+    powers = c.power(*rows.T)
+    powers[~np.isfinite(r.power(*rows.T))] = np.nan
+    if np.isfinite(powers).any():
+        largest = np.nanquantile(powers, _LARGEST, method='nearest')
+        at = np.append(at, rows[powers == largest][:1], axis=0)
+    opening, pressure = at.T
+    now, then = c.power(opening, pressure), r.power(opening, pressure)
+    gains = [_gains(curve, opening, pressure)[0] for curve in (c, r)]
+    piece = piece_of(c, opening * pressure**c.pressure_exponent)
+    cells = [
+        [
+            say.decimals(float(now[k]), 0), *(say.plain(float(gain[k]), 3) for gain in gains),
+            say.with_error(float(now[k] - then[k]), shift.pieces[piece[k]].error_mw),
+        ]
+        for k in np.argsort(now) if np.isfinite(now[k] - then[k])
+    ]  # fmt: skip
+    return head, cells
+
+
+def reference_table(data: Identified) -> str:
+    """Return the table of the curve against the reference by load; empty without common loads."""
+    head, cells = reference_cells(data)
+    caption = (
+        'Both curves at the same opening and pressure. The last row is the largest load at which '
+        'both are known.'
+    )
     return html.table(head, cells, caption=caption) if cells else ''
 
 

@@ -15,6 +15,7 @@ from valveflow_ros.records import FloatArray, IntArray, Signal
 from valveflow_ros.report import figure as plot
 from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
+from valveflow_ros.report.answer import reference_table
 from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
 from valveflow_ros.report.identified import Identified
 from valveflow_ros.report.page import Section
@@ -395,6 +396,7 @@ def shift_section(data: Identified) -> Section | None:
     ]  # fmt: skip
     parts: list[str | Figure] = [
         html.notice(told) if shift.moved else html.paragraph(told),
+        reference_table(data),
         html.table(head, [_row(k, piece, scale) for k, piece in enumerate(shift.pieces, 1)]),
     ]
     found = segment_residuals(data.reference, data.segments)

@@ -98,6 +98,8 @@ def _text(found: Identified) -> str:
     from valveflow_ros.report.words import counted, held_words, moment, percent, plain
 
     c = found.characteristic
+    loads, gains = answer.gain_cells(found)
+    compared, against = answer.reference_cells(found)
     return command.lines(
         f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
         answer.doubt(found),
@@ -106,7 +108,7 @@ def _text(found: Identified) -> str:
         answer.pieces_doubt(c),
         answer.range_words(found),
         answer.form_words(found),
-        _by_load(found),
+        command.table(gains, loads),
         _pieces(found),
         _breakpoints(found.shown),
         _dynamics(c),
@@ -119,15 +121,9 @@ def _text(found: Identified) -> str:
         held_words(c.held),
         *c.notes,
         '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
+        command.table(against, compared),
         command.rejected_words(found.counts) if rejected(found.counts) else '',
     )
-
-
-def _by_load(found: Identified) -> str:
-    from valveflow_ros.report.answer import gain_cells
-
-    head, cells = gain_cells(found)
-    return command.table(cells, head)
 
 
 def _pieces(found: Identified) -> str:
