@@ -158,6 +158,8 @@ def test_a_model_of_the_wrong_form_is_the_first_finding_and_one_of_the_right_for
     assert form.gain.p_value < 0.01
     right = vf.diagnose(plant(4).log, model=identified().characteristic)
     assert not {'form', 'choked', 'exponent'} & {c.name for c in right.diagnosis.causes}
+    unjudged = dict(right.diagnosis.rejected)
+    assert 'are results of the fit' in unjudged['exponent'] == unjudged['curve_shape']
     # The model is kept with its form.
     right.write(tmp_path)
     model = load_model(tmp_path / 'extended_model.json')

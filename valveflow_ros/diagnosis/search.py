@@ -328,7 +328,6 @@ def _is_bend(model: Extended, named: FittedCause, turned: bool) -> bool:
 
 Progress = Callable[[float, str], None]
 
-_OF_FORM = {'exponent': 'the exponent', 'curve_shape': 'the curve'}
 MOST_CAUSES = 4
 MOST_RIVALS = 7
 PENALTY = 5.0  # log-likelihood that each parameter chosen from the data must gain
@@ -412,9 +411,10 @@ def search(
     if task.grids.form.scaled:
         # They were determined together with the form, in this record or that of the given model:
         # the exponent is a parameter of it, and the curve shape is the error of straight pieces.
-        for name, what in _OF_FORM.items():
+        for name in ('exponent', 'curve_shape'):
             found.reasons[name] = (
-                f'cannot be judged: {what} of p^m F(V) + c was itself found from a record'
+                'cannot be judged: in the form p^m F(V) + c the exponent m and the curve F are '
+                'results of the fit, with no expected values to compare them with'
             )
             barred.add(name)
     found.tried = len(every) - len(barred)
