@@ -134,10 +134,33 @@ class Change:
         after = plain if self.name == CURVE else self.changed
         gain = sealed_gain(task, self.given, after, len(_KINDS) + 1)
         experiment = _EXPERIMENT if self.near else ''
+        full = float(np.quantile(answer(task.grids, self.given)[task.rows], _FULL_LOAD))
+        before, now = _per_percent(task, full, self.given.base, after.base)
+        meaning = f'{self.meaning} There' if self.meaning else _where(full)
+        meaning += f' 1 % of opening gives {now:.3g} MW, in the model given {before:.3g} MW.'
         return NamedCause(
             self.name, self.sentence, self.parameters, gain, experiment, self.near,
-            meaning=self.meaning,
+            meaning=meaning,
         )  # fmt: skip
+
+
+def _where(full: float) -> str:
+    return f'At full load (from {full:.0f} MW on)'
+
+
+def _per_percent(
+    task: Task, full: float, given: RegionalModel, now: RegionalModel
+) -> tuple[float, float]:
+    """Return the mean MW per 1 % of opening of two models where the first gives full load."""
+    grids = task.grids
+    rows = (grids.usable > 0) & (given.static(grids.u, grids.scale) >= full)
+    u, scale = grids.u[rows], grids.scale[rows]
+    step = _SECANT * u / grids.pressure[rows] ** grids.form.input_exponent
+    first, second = (
+        m.static(u * (1.0 + _SECANT), scale) - m.static(u * (1.0 - _SECANT), scale)
+        for m in (given, now)
+    )
+    return float(np.mean(first / step) / 2.0), float(np.mean(second / step) / 2.0)
 
 
 def since_model(task: Task, base: RegionalModel) -> Change | str:
@@ -286,9 +309,7 @@ def _change(
     sentence = f'{said} (95 % interval {ends[0]} to {ends[1]} {unit}); {_BEFORE}.'
     full = float(np.quantile(here, _FULL_LOAD))
     by = float(np.mean(moved[here >= full]))
-    meaning = f'At full load (from {full:.0f} MW on) this makes {abs(by):.2g} MW ' + (
-        'more.' if by > 0.0 else 'less.'
-    )
+    meaning = f'{_where(full)} this makes {abs(by):.2g} MW {"more" if by > 0.0 else "less"}.'
     return Change(
         name, given, changed, {kind.parameter: Estimate(value, low, high, kind.unit)},
         sentence, meaning,
