@@ -89,7 +89,8 @@ NOTICED = {
         ['1 row had a time that stood there before', '1 gap, the longest 5 min from'],
     ),
     'missing values': (
-        HEADER, ending(rows(20), 'Bad Input', ''), OPTIONS, ['2 values missing', 'Bad Input'],
+        HEADER, ending(rows(20), 'Bad Input', ''), OPTIONS,
+        ["2 values missing (1 'Bad Input', 1 empty)."],
     ),
     'valve_opening in another unit': (
         HEADER, rows(), mapped('valve_opening', 'CV'),

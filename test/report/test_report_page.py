@@ -265,7 +265,8 @@ def test_quality_tells_what_was_not_used(identified):
     counts = {'generated_power': {'accepted': 90, 'impossible': 7, 'late': 3, 'duplicate': 0}}
     words = words_of(identification_report(replace(identified, counts=counts)))
     assert 'Readings not used: 7 impossible value.' in words
-    assert 'too late for its row' in words
+    assert '97 7 impossible value, 3 too late for its row (used later)' in words
+    assert 'all used' in words
     assert 'time given twice' not in words
 
 

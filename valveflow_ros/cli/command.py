@@ -450,14 +450,13 @@ def table(rows: Sequence[Sequence[str]], head: Sequence[str]) -> str:
 
 def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
     """Return one line per signal about the readings that were not used."""
-    from valveflow_ros.report.data import REASON_WORDS, rejected
-    from valveflow_ros.report.words import count
+    from valveflow_ros.report.data import reason_words, rejected
 
-    told = []
-    for topic, by_reason in counts.items():
-        if refused := rejected({topic: by_reason}):
-            words = ', '.join(f'{count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
-            told.append(f'  {topic}: {words}')
+    told = [
+        f'  {topic}: {reason_words(refused)}'
+        for topic, by_reason in counts.items()
+        if (refused := rejected({topic: by_reason}))
+    ]
     if not any(n for by_reason in counts.values() for n in by_reason.values()):
         return 'No reading was found.'
     return '\n'.join(['Readings not used:', *told]) if told else 'Every reading was used.'

@@ -75,6 +75,12 @@ def rejected(counts: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
     return {reason: n for reason, n in total.items() if n}
 
 
+def reason_words(counts: Mapping[str, int]) -> str:
+    """Return the readings of each reason in words; empty if there are none."""
+    told = ((counts.get(reason, 0), words) for reason, words in REASON_WORDS.items())
+    return ', '.join(f'{say.count(n)} {words}' for n, words in told if n)
+
+
 def usable_share(table: SampleTable) -> float:
     """Return the fraction of rows in which opening, pressure and power are all known."""
     if not len(table):
@@ -95,26 +101,20 @@ def quality_words(data: Identified) -> str:
         f'{say.duration(found[0].seconds)} from {say.moment(found[0].start_ns)}. '
         if found else 'No row is missing. '
     )  # fmt: skip
-    refused = rejected(data.counts)
-    told = ', '.join(f'{say.count(n)} {REASON_WORDS[r]}' for r, n in refused.items())
+    refused = reason_words(rejected(data.counts))
     return html.paragraph(
-        words + (f'Readings not used: {told}.' if refused else 'Every reading was used.')
+        words + (f'Readings not used: {refused}.' if refused else 'Every reading was used.')
     )
 
 
 def quality_table(data: Identified) -> str:
     """Return readings, rejections and ranges, one row per signal in the data."""
-    occurred = {r for by_reason in data.counts.values() for r, n in by_reason.items() if n > 0}
-    reasons = [r for r in REASON_WORDS if r in occurred]
     sent = [i for i in SIGNALS if i.required or any(data.counts.get(i.topic, {}).values())]
-    head = [
-        'signal', 'readings', *(REASON_WORDS[r] for r in reasons),
-        'rows with a value', 'lowest', 'median', 'highest',
-    ]  # fmt: skip
-    return html.table(head, [_row(info, data, reasons) for info in sent])
+    head = ['signal', 'readings', 'of these', 'rows with a value', 'lowest', 'median', 'highest']
+    return html.table(head, [_row(info, data) for info in sent])
 
 
-def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
+def _row(info: SignalInfo, data: Identified) -> list[str]:
     counts = data.counts.get(info.topic, {})
     values = data.table.column(info.signal)
     known = values[np.isfinite(values)]
@@ -122,7 +122,7 @@ def _row(info: SignalInfo, data: Identified, reasons: list[str]) -> list[str]:
     return [
         info.topic.replace('_', ' '),
         say.count(sum(n for reason, n in counts.items() if reason != 'late')),
-        *(say.count(counts.get(reason, 0)) for reason in reasons),
+        reason_words(counts) or 'all used',
         say.percent(len(known) / len(values) if len(values) else float('nan')),
         say.plain(float(low)), say.plain(float(middle)),
         f'{say.plain(float(high))} {info.unit.replace("degC", "°C")}',

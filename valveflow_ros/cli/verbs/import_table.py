@@ -42,7 +42,7 @@ with column names that the program cannot recognise:
       --constant main_steam_temperature=540 --time-zone Europe/Berlin"""
 
 _OPCUA = 'opcua://'
-_HEAD = ('your column', 'is', 'why', 'in', 'runs from', '', '')
+_HEAD = ('your column', 'is', 'why', 'in', 'runs from')
 _FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
 # Columns named in a sentence.
 _NAMED = 3
@@ -230,17 +230,16 @@ def _understood(table: TableImport) -> list[str]:
     rows = []
     for s in sources:
         if s.constant:
-            rows.append(['(constant)', s.topic, 'as you said', '', plain(s.low), s.unit, ''])
+            rows.append(['(constant)', s.topic, 'as you said', '', f'{plain(s.low)} {s.unit}'])
             continue
         taken = f'from {s.written_unit}' if s.written_unit != s.unit else ''
         if s.topic == 'main_steam_pressure' and not s.air and s.written_unit not in DIFFERENCES:
             taken = f'{taken or s.unit}, absolute'
-        lost = f'{counted(s.missing, "value")} missing' if s.missing else ''
-        span = f'{plain(s.low)} to {plain(s.high)}'
-        rows.append([s.column, s.topic, s.ground or '', taken, span, s.unit, lost])
+        span = f'{plain(s.low)} to {plain(s.high)} {s.unit}'
+        rows.append([s.column, s.topic, s.ground or '', taken, span])
     for name, series in table.further.items():
         low, high = plain(float(series.values.min())), plain(float(series.values.max()))
-        rows.append([series.column, name, 'covariate', '', f'{low} to {high}', series.unit, ''])
+        rows.append([series.column, name, 'covariate', '', f'{low} to {high} {series.unit}'])
     lines = [
         f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
         f'Times: {table.time_words}; zone: {zone}.',
@@ -249,9 +248,10 @@ def _understood(table: TableImport) -> list[str]:
     lines += [source.air for source in sources if source.air]
     for source in sources:
         told = [f"{count(n)} '{word}'" for word, n in source.words.items()]
-        told += [f'{count(source.empty)} empty'] if source.empty and source.words else []
-        if told:
-            lines.append(f'Not numbers in {source.column}: {", ".join(told)}.')
+        told += [f'{count(source.empty)} empty'] if source.empty and told else []
+        if source.missing:
+            found = f' ({", ".join(told)})' if told else ''
+            lines.append(f'{source.column}: {counted(source.missing, "value")} missing{found}.')
     if table.ignored:
         lines.append(f'Not used: {", ".join(table.ignored)}.')
     if table.numeric_ignored:

@@ -133,12 +133,15 @@ def _text(name: str, data: dict[str, Any], signals: dict[str, dict[str, Any]]) -
     ]  # fmt: skip
     head = ['signal', 'from', 'readings', 'step', 'lowest', 'median', 'highest', 'unit']
     absent = [i.topic for i in SIGNALS if i.required and i.topic not in signals]
-    found = [
-        f'{topic}: {counted(len(gaps), "gap")}, the longest {duration(gaps[0].seconds)} '
+    found = {
+        topic: f'{counted(len(gaps), "gap")}, the longest {duration(gaps[0].seconds)} '
         f'from {moment(gaps[0].start_ns)}.'
         for topic, s in signals.items()
         if (gaps := s['gaps'])
-    ]
+    }
+    recorded = [topic for topic, s in signals.items() if s['source'] != 'constant']
+    if list(found) == recorded and len({*found.values()}) == 1:
+        found = {'every signal': next(iter(found.values()))}
     attached = ', '.join(
         f'{name} ({count(size)} bytes)' for name, size in data['attachments'].items()
     )
@@ -150,7 +153,7 @@ def _text(name: str, data: dict[str, Any], signals: dict[str, dict[str, Any]]) -
         command.table(rows, head),
         f'Not in the log: {", ".join(absent)}.' if absent else '',
         command.rejected_words(data['readings']),
-        *found,
+        *(f'{which}: {gaps}' for which, gaps in found.items()),
         'No gaps.' if signals and not found else '',
         f'Attached: {attached}.' if attached else '',
         f'Damaged: {damaged}; "valveflow recover" makes a whole file of the rest.'
