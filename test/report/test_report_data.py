@@ -46,7 +46,9 @@ def test_hours_add_up_to_the_log(identified):
 
 def shares_of(data):
     """Return the middles of the stretches in ns, and the share there of each signal."""
-    (heat,) = presence_figure(data).traces
+    figure = presence_figure(data)
+    (heat,) = figure.traces
+    assert figure.layout['xaxis']['tickangle'] == 0, 'inclined times are cut off'
     edges_ns, shares = np.array(heat['x']) * 1e6, np.array(heat['z']) / 100.0
     return 0.5 * (edges_ns[1:] + edges_ns[:-1]), dict(zip(heat['y'], shares, strict=True))
 

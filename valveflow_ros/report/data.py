@@ -198,7 +198,8 @@ def presence_figure(data: Identified) -> Figure | None:
         }
     ]  # fmt: skip
     layout: Spec = {
-        'xaxis': plot.time_axis(), 'yaxis': {'type': 'category', 'autorange': 'reversed'},
+        'xaxis': plot.time_axis(tickangle=0, nticks=5),
+        'yaxis': {'type': 'category', 'autorange': 'reversed'},
     }  # fmt: skip
     caption = (
         '<b>Blue: complete. Yellow to red: values are missing then.</b> Missing are times '
