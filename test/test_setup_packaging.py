@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / 'tools'))
 
 import headers  # noqa: E402
+import try_install  # noqa: E402
 import versions  # noqa: E402
 
 LOCK = (ROOT / 'requirements.lock').read_text(encoding='utf-8')
@@ -238,6 +239,23 @@ def test_the_tree_of_other_versions(monkeypatch, tmp_path, capsys):
     assert (copy / 'a' / 'kept.py').read_text() == 'a/kept.py'
     assert versions.main('/nowhere/python3.12') == 1
     assert capsys.readouterr().err == 'setup: /nowhere/python3.12: No such file or directory\n'
+
+
+def test_a_trial_of_the_wheel_tells_each_step_before_it_begins(monkeypatch, capsys):
+    steps = []
+
+    def run(command, folder, **environment):
+        steps.append(capsys.readouterr().err.count('\n'))
+        if environment:
+            Path(environment['NUMBA_CACHE_DIR']).mkdir(exist_ok=True)
+        return 1.0, '3 13'
+
+    monkeypatch.setattr(try_install, 'run', run)
+    monkeypatch.setattr(try_install, 'build', lambda folder: run([], folder))
+    monkeypatch.setattr(sys, 'argv', ['try_install', 'python'])
+    assert try_install.main() == 0
+    # build, version; two lines and venv; install, freeze; help, simulate; identify twice.
+    assert steps == [1, 0, 2, 1, 0, 1, 0, 1, 1]
 
 
 def test_every_source_file_names_copyright_and_licence_once(monkeypatch, tmp_path, capsys):

@@ -6,7 +6,8 @@
 
 For each Python given by path, with the oldest libraries that the metadata allow and with the
 newest: install the wheel with pip, simulate half a day, identify it with nothing compiled, and
-identify it again. With ``--keep`` the table is written to benchmarks/results/install.json.
+identify it again. Each step is told on stderr when it begins. With ``--keep`` the table is written
+to benchmarks/results/install.json.
 """
 
 from __future__ import annotations
@@ -36,6 +37,11 @@ IDENTIFY = ('identify', 'plant.mcap', '-o', 'result', '--quiet')
 
 class FailedError(Exception):
     """A command failed; the message is its output."""
+
+
+def say(step: str) -> None:
+    """Print the step that begins now."""
+    print(f'{time.strftime("%H:%M:%S")} {step}', file=sys.stderr, flush=True)
 
 
 def run(command: list[str | Path], folder: Path, **environment: str) -> tuple[float, str]:
@@ -80,18 +86,23 @@ def build(folder: Path) -> Path:
 
 def trial(python: str, wheel: Path, libraries: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Install the wheel and use it; return times in s, sizes in MB and versions."""
+    say('an empty environment is made')
     run([python, '-m', 'venv', folder / 'venv'], folder)
     inside = folder / 'venv' / 'bin'
     empty = megabytes(folder / 'venv')
+    say('wheel and libraries are downloaded and installed')
     install_s, _ = run([inside / 'python', '-m', 'pip', 'install', wheel, *libraries], folder)
     size = megabytes(folder / 'venv') - empty
     frozen = run([inside / 'python', '-m', 'pip', 'freeze'], folder)[1]
     cache = {'NUMBA_CACHE_DIR': str(folder / 'compiled')}
+    say('half a day is simulated')
     help_s, _ = run([inside / 'valveflow', '--help'], folder)
     run([inside / 'valveflow', 'simulate', '-o', 'plant.mcap', '--days', '0.5'], folder, **cache)
     # Remove the simulation's compiled code, which would shorten the first identification.
     shutil.rmtree(folder / 'compiled')
+    say('first identify; the program is compiled')
     first_s, _ = run([inside / 'valveflow', *IDENTIFY], folder, **cache)
+    say('second identify')
     again_s, _ = run([inside / 'valveflow', *IDENTIFY], folder, **cache)
     return {
         'versions': dict(LIBRARIES.findall(frozen)), 'install_s': install_s, 'size_mb': size,
@@ -109,12 +120,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         try:
+            say('the wheel is built')
             wheel = build(folder)
             pythons = {path: version(path) for path in options.python}
         except (FailedError, OSError) as error:
             print(f'try_install: {error}', file=sys.stderr)
             return 1
-        print('Python  libraries  install  size    --help  first identify  second')
+        print('Python  libraries  install  size    --help  first identify  second', flush=True)
         for path, number in pythons.items():
             for which, libraries in SETS.items():
                 if which == 'oldest' and number > LAST_OF_OLDEST:
@@ -122,6 +134,7 @@ def main() -> int:
                 place = folder / 'trial'
                 place.mkdir()
                 name = '{}.{}'.format(*number)
+                say(f'Python {name} with the {which} libraries:')
                 try:
                     row = trial(path, wheel, libraries, place)
                 except FailedError as error:
