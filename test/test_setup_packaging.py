@@ -153,6 +153,11 @@ def test_what_apt_does_not_bring_is_said_with_the_command(arguments):
     line = re.search(r'pip install --break-system-packages (.*)', page)[1]
     assert set(line.split()) == needed - by_apt - by_mcap | {"'pyarrow<26'"}
     assert 'rosdep install --from-paths src src/valveflow_ros/msg ' in page
+    image = (ROOT / 'docker' / 'Dockerfile.jazzy').read_text(encoding='utf-8')
+    taken = re.search(r'--break-system-packages (mcap .*) \\', image)[1]
+    assert set(taken.split()) == {*line.split(), 'asyncua'}
+    # pip cannot remove what apt has installed.
+    assert '--ignore-installed cryptography' in image
 
 
 def test_the_tests_load_without_what_apt_does_not_bring():
