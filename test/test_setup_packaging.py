@@ -160,6 +160,14 @@ def test_what_apt_does_not_bring_is_said_with_the_command(arguments):
     assert '--ignore-installed cryptography' in image
 
 
+@pytest.mark.parametrize('name', ['Dockerfile', 'Dockerfile.jazzy'])
+def test_an_image_keeps_the_compiled_program_for_every_user(name):
+    """Numba uses a cache only where it can write."""
+    image = (ROOT / 'docker' / name).read_text(encoding='utf-8')
+    cache = re.search(r'NUMBA_CACHE_DIR=(\S+)', image)[1]
+    assert re.search(rf'diagnose plant.mcap [^#]*chmod -R a\+rwX {cache}\n', image)
+
+
 def test_the_tests_load_without_what_apt_does_not_bring():
     """`colcon test` skips what needs such a library, instead of failing to load the file."""
     extras = {
