@@ -495,8 +495,8 @@ class Certainty:
         A share s at once and the rest with a lag T is 1 - (1 - s) exp(-t / T), which is the
         answer of the lag alone from ``-T ln(1 - s)`` on.
         """
-        longest = float(np.max(self.model.base.time_constants))
-        return -longest * float(np.log(1.0 - _ANSWERED_AT_ONCE))
+        shortest = float(np.min(self.model.base.time_constants))
+        return -shortest * float(np.log(1.0 - _ANSWERED_AT_ONCE))
 
     def _columns_of(self, c: int) -> range:
         """Return the columns of a cause in the table: its parameters fitted by Gauss-Newton."""

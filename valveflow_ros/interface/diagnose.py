@@ -200,12 +200,7 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
-    if (
-        model is None
-        and not form.scaled
-        and form != StaticForm(exponent=settings.real('pressure_exponent'))
-    ):
-        notes.append(_FITTED_EXPONENT.format(form.exponent))
+    fitted = model is None and not form.scaled and 'pressure_exponent' not in given
     beside = _covariate_rows(log, covariates, rows.table)
     record = search.Record(
         rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
@@ -221,6 +216,15 @@ def diagnose(
     asked = None if model is None or earlier is not None else rows.asked(form)
     if asked is None:
         found = search.diagnose(record, regional, model is not None, part)
+        wrong = [c.parameters['dm'].value for c in found.causes if c.name == 'exponent']
+        if fitted and wrong:
+            # The other causes had bent the exponent that was fitted without them.
+            form = replace(form, exponent=form.exponent + wrong[0])
+            record = replace(record, form=form)
+            regional = first_model(rows.table, step, form, settle)
+            found = search.diagnose(record, regional, False, part)
+        if fitted and form != StaticForm(exponent=settings.real('pressure_exponent')):
+            notes.append(_FITTED_EXPONENT.format(form.exponent))
     else:
         form, there = asked
         other = replace(record, form=form)
