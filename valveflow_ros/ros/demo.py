@@ -19,7 +19,6 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import Executor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
@@ -32,6 +31,7 @@ from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.terminal.text import number, whole
 from valveflow_ros.ros.decoding import from_time
 from valveflow_ros.ros.domain import run, spinning
+from valveflow_ros.ros.listening import LATCHED
 from valveflow_ros.ros.process import Parser, StopFlag
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -40,7 +40,6 @@ _FAULT, _FAULT_MW = 'curve_step', -12.0
 _FAULT_FROM = 0.5  # fraction of the run after which the fault begins
 _MONITOR = '/valveflow_monitor'
 _DAYS = 3.0
-_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _BEFORE_ACKNOWLEDGING_S = 0.2
 _PATIENCE_S = 10.0
 _QUIET_LOOKS = 3
@@ -265,7 +264,7 @@ class Watch(Node):
             (Alarm, 'alarms', self._on_alarm),
             (Diagnosis, 'diagnosis', story.on_diagnosis),
         ):
-            self.create_subscription(kind, f'{_MONITOR}/{topic}', take, _LATCHED)
+            self.create_subscription(kind, f'{_MONITOR}/{topic}', take, LATCHED)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
         self._acknowledge = self.create_client(Trigger, f'{_MONITOR}/acknowledge_alarms')
         self._diagnose = self.create_client(Trigger, f'{_MONITOR}/diagnose')

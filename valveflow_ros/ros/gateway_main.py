@@ -20,7 +20,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic, PlantSample
 
@@ -39,6 +39,7 @@ from valveflow_ros.ros.declare import declare_all
 from valveflow_ros.ros.decoding import PLANT_SAMPLE, from_time
 from valveflow_ros.ros.domain import run, spinning
 from valveflow_ros.ros.encoding import header
+from valveflow_ros.ros.listening import LATCHED
 from valveflow_ros.ros.node.diagnostics import (
     Changes,
     Item,
@@ -59,7 +60,6 @@ _CLOCK_S = 2.0
 # Time for which a problem with a value is shown.
 _SHOWN_S = 60.0
 _LOOK_S, _END_S, _OFFER_S = 0.02, 6.0, 60.0
-_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _KINDS = {'double': 'Double', 'string': 'String', 'boolean': 'Boolean', 'uint8': 'Byte',
           'uint32': 'UInt32', 'uint64': 'UInt64'}  # fmt: skip
 _TIME, _CAUSES = 'builtin_interfaces/Time', 'sequence<valveflow_msgs/DiagnosisCause>'
@@ -225,9 +225,9 @@ class ResultsBridge:
         self._present = True
         for kind, name in ((FlowCharacteristic, 'characteristic'), (Diagnosis, 'diagnosis')):
             node.create_subscription(
-                kind, f'{self._monitor}/{name}', partial(self._on_message, name), _LATCHED
+                kind, f'{self._monitor}/{name}', partial(self._on_message, name), LATCHED
             )
-        node.create_subscription(Alarm, f'{self._monitor}/alarms', self._on_alarm, _LATCHED)
+        node.create_subscription(Alarm, f'{self._monitor}/alarms', self._on_alarm, LATCHED)
 
     def look(self) -> None:
         """Update the status of the shown values if the monitor has ended or is back."""

@@ -23,7 +23,7 @@ from valveflow_ros.report.terminal.board import (
     MonitorState,
 )
 
-_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Lost samples are only missing in the display.
 _STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CURVE_TOPIC = '/characteristic'
@@ -98,7 +98,7 @@ class Listener:
             self.heard.add(type_name)
             self.board.take(type_name, fields_of(message))
 
-        self._node.create_subscription(kind, topic, take, _LATCHED)
+        self._node.create_subscription(kind, topic, take, LATCHED)
 
     def _on_prediction(self, message: Prediction) -> None:
         self.heard.add(PREDICTION)

@@ -7,12 +7,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import sys
 import time
 from collections.abc import Sequence
 from datetime import tzinfo
-from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -20,6 +18,7 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 from valveflow_msgs.srv import OperateAlarm
 
+from valveflow_ros.logs.outputs import finite
 from valveflow_ros.records import NS_PER_S, zone_of
 from valveflow_ros.report.terminal.board import CURVE, HEALTH, PREDICTION, MonitorState
 from valveflow_ros.report.terminal.frame import Frame
@@ -213,7 +212,7 @@ def _once(
     if frame.last is None and not frame.note:
         frame = dataclasses.replace(frame, note=_no_sample(frame.now_ns))
     if as_json:
-        content = _finite(dataclasses.asdict(frame))
+        content = finite(dataclasses.asdict(frame))
         print(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
     else:
         print(Screen(sys.stdout, zone=zone).text(frame), flush=True)
@@ -227,15 +226,6 @@ def _no_sample(shown_ns: int) -> str:
     if shown_ns and age_ns >= 0:
         told += f' The newest message shown is {duration(age_ns / NS_PER_S)} old.'
     return told
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers that are not finite by None: JSON cannot hold them."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 if __name__ == '__main__':
