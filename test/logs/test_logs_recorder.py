@@ -372,7 +372,7 @@ def test_misuse_is_one_sentence(folder):
 
 def test_only_what_was_asked_for_is_repeated_and_a_hash_is_made_where_none_is_given(folder):
     deep, given = folder / 'deep', 'RIHS01_' + '0' * 64
-    recorder = recorder_of(deep, name='mine', metadata={'m': {'a': 'b'}})
+    recorder = recorder_of(deep, name='mine')
     recorder.add_topic('/hashed', FLOAT64, type_hash=given)
     recorder.add_topic('/own', 'x_msgs/msg/Own', definition='float64 data\n')
     # Again changes nothing, whatever else is said.
@@ -396,7 +396,6 @@ def test_only_what_was_asked_for_is_repeated_and_a_hash_is_made_where_none_is_gi
     assert hashes['/valve_opening'] == STOCK.type_hash(FLOAT64) != hashes['/own'] != given
     assert hashes['/own'].startswith('RIHS01_')
     assert found.topics['/own'].definition == 'float64 data\n'
-    assert found.metadata['m'] == {'a': 'b'}
     assert all(p.name.startswith('mine_') for p in deep.glob('*.mcap'))
     assert deep.stat().st_mode & 0o777 == 0o700
     assert recorder.folder == deep

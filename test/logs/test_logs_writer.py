@@ -33,6 +33,7 @@ from mcap.reader import make_reader
 
 from valveflow_ros.errors import DataError, InputError, RecordingError
 from valveflow_ros.logs import Message, RecordingWriter, open_log, write_samples, write_table
+from valveflow_ros.logs.mcap.importing import write_readings
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
 AnyReader = pytest.importorskip('rosbags.highlevel').AnyReader
@@ -274,8 +275,8 @@ def test_samples_come_back_bit_for_bit_and_strangers_read_the_same(tmp_path):
 
 def test_a_folder_when_the_name_is_no_file(tmp_path):
     folder = tmp_path / 'ten'
-    written = write_samples(
-        wander(10, seed=1), folder, definitions=STOCK, prefix='/u1/',
+    written = write_readings(
+        [table_to_readings(wander(10, seed=1))], [], folder, definitions=STOCK, prefix='/u1/',
         attachments={'truth.json': b'{}'}, metadata={'simulation': {'seed': '1'}},
     )  # fmt: skip
     assert written.path == folder / 'ten_0.mcap'

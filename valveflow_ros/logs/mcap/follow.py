@@ -37,6 +37,7 @@ from valveflow_ros.logs.mcap.records import (
 )
 from valveflow_ros.logs.mcap.scan import (
     CHUNK_HEAD_SIZE,
+    KINDS,
     Scanner,
     candidates,
     has_chunk_at,
@@ -78,7 +79,6 @@ _MOST_ATTACHED = 1 << 20
 _MOST_ADDED = 256  # bytes that a later version of the format may add to a record
 _GROUP_BYTES = 1 << 20
 _NEAR = 1 << 12
-_KINDS = frozenset(int(op) for op in Opcode)
 # Records of known length, which distinguishes them from a chunk with a damaged opcode.
 _LAST = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 
@@ -214,7 +214,7 @@ class Follower:
             whole = source.size >= after + FOOTER_SIZE
             self._ended = whole and source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
             return None
-        known = op in _KINDS or is_foreign(source, start)
+        known = op in KINDS or is_foreign(source, start)
         if not known or op in _LAST or (op == Opcode.CHUNK and length < CHUNK_HEAD_SIZE):
             return self._beyond_damage(source)
         if after > source.size:

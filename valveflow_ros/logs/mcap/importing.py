@@ -48,9 +48,6 @@ def write_samples(
     table: SampleTable,
     path: str | Path,
     *,
-    prefix: str = '',
-    attachments: Mapping[str, bytes] | None = None,
-    metadata: Metadata | None = None,
     definitions: Definitions | None = None,
     overwrite: bool = False,
 ) -> WrittenLog:
@@ -58,35 +55,13 @@ def write_samples(
 
     The time of a sample is the publish time of its values. The log times of the
     values of one sample differ by one nanosecond, so that every reader sees them
-    in the same order.
-
-    Parameters
-    ----------
-    table : SampleTable
-        NaN in a required signal is written as a value of bad quality.
-    path : str or Path
-        A file if it ends in ``.mcap``; otherwise a folder like that of rosbag2.
-    prefix : str
-        Namespace before the topics, such as ``/unit1``.
-    attachments, metadata, definitions
-        As in `RecordingWriter`.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    DataError
-        If there is nothing to write.
-    RecordingError
-        If the file exists or cannot be written.
+    in the same order. NaN in a required signal is written as a value of bad quality.
+    Other arguments and errors are those of `write_readings`.
     """
     optional = [i.signal for i in SIGNALS if np.isfinite(table.column(i.signal)).any()]
     starts = range(0, len(table), _BLOCK_ROWS)
     blocks = (table_to_readings(table.part(start, start + _BLOCK_ROWS)) for start in starts)
-    return write_readings(
-        blocks, optional, path, prefix=prefix, attachments=attachments, metadata=metadata,
-        definitions=definitions, overwrite=overwrite,
-    )  # fmt: skip
+    return write_readings(blocks, optional, path, definitions=definitions, overwrite=overwrite)
 
 
 def write_readings(
@@ -101,11 +76,31 @@ def write_readings(
     overwrite: bool = False,
     further: Sequence[str] = (),
 ) -> WrittenLog:
-    """Write readings block by block; otherwise as `write_samples`.
+    """Write readings block by block, each signal as a ``std_msgs/Float64`` topic of its name.
 
-    The blocks are in time order, within and across. ``signals`` are those that occur; required
-    signals have a topic in any case. ``further`` are topics of further columns, whose readings
-    have the numbers that follow those of the signals.
+    Parameters
+    ----------
+    blocks : iterable of Readings
+        In time order, within and across.
+    signals : collection of Signal
+        Those that occur; required signals have a topic in any case.
+    path : str or Path
+        A file if it ends in ``.mcap``; otherwise a folder like that of rosbag2.
+    prefix : str
+        Namespace before the topics, such as ``/unit1``.
+    attachments, metadata, definitions
+        As in `RecordingWriter`.
+    overwrite : bool
+        Replace an existing file.
+    further : sequence of str
+        Topics of further columns, whose readings have the numbers after those of the signals.
+
+    Raises
+    ------
+    DataError
+        If there is nothing to write.
+    RecordingError
+        If the file exists or cannot be written.
     """
     place = Path(path)
     target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'

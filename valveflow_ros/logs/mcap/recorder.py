@@ -22,7 +22,7 @@ from valveflow_ros.logs.mcap.definitions import type_hash as hash_of
 from valveflow_ros.logs.mcap.folder import is_split_of
 from valveflow_ros.logs.mcap.records import LayoutError
 from valveflow_ros.logs.mcap.recover import RecoveryReport, recover_leftovers
-from valveflow_ros.logs.mcap.writer import Message, Metadata, OpenFile, Qos, RecordingWriter
+from valveflow_ros.logs.mcap.writer import Message, OpenFile, Qos, RecordingWriter
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder
 from valveflow_ros.logs.source import os_errors
 
@@ -254,7 +254,7 @@ class Recorder:
         The recording's folder; created if absent, otherwise continued.
     settings : RecorderSettings
         Periods and limits.
-    name, definitions, attachments, metadata, open_file
+    name, definitions, attachments, open_file
         As in `RecordingWriter`.
     free_bytes : callable
         Returns the free bytes on the disk of a folder.
@@ -273,7 +273,6 @@ class Recorder:
         name: str | None = None,
         definitions: Definitions | None = None,
         attachments: Mapping[str, bytes] | None = None,
-        metadata: Metadata | None = None,
         open_file: OpenFile = PartFile,
         free_bytes: Callable[[Path], int] = free_bytes_of,
     ) -> None:
@@ -291,8 +290,7 @@ class Recorder:
         self._latched: dict[str, Message] = {}
         self._make_writer = partial(
             RecordingWriter, self.folder, name=name, definitions=self._definitions,
-            attachments=attachments, metadata=metadata, head_messages=self._latched.values,
-            open_file=open_file,
+            attachments=attachments, head_messages=self._latched.values, open_file=open_file,
         )  # fmt: skip
         self._writer: RecordingWriter | None = None
         self._path: Path | None = None

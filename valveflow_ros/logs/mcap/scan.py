@@ -112,7 +112,7 @@ def is_foreign(source: Source, position: int) -> bool:
 
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_BLOCK = 4096
-_KINDS = frozenset(int(op) for op in Opcode)
+KINDS = frozenset(int(op) for op in Opcode)
 # Shorter records cannot contain a chunk.
 _SMALLEST_CHUNK = RECORD_HEAD.size + CHUNK_HEAD_SIZE + 12
 
@@ -427,7 +427,7 @@ class Scanner:
             self.findings.add_damage(f'the {kind} at byte {position}: {error}')
 
     def _known(self, op: int, position: int) -> bool:
-        return op in _KINDS or is_foreign(self._source, position)
+        return op in KINDS or is_foreign(self._source, position)
 
     def _head(self, position: int) -> tuple[int, int]:
         raw = self._source.read(position, RECORD_HEAD.size)
@@ -457,7 +457,7 @@ class Scanner:
         if self._begins_record(position):
             return True
         op, length = self._head(position)
-        if position + RECORD_HEAD.size + length <= size or op not in _KINDS:
+        if position + RECORD_HEAD.size + length <= size or op not in KINDS:
             return False
         # The last chunk of an unfinished file may be cut off, with a consistent head.
         return has_chunk_at(self._source, position)

@@ -11,6 +11,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from valveflow_ros.logs import (
     recover_leftovers,
 )
 from valveflow_ros.logs.part_file import PART_SUFFIX, make_folder
+from valveflow_ros.logs.source import os_errors
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node.diagnostics import Level
 
@@ -64,18 +66,13 @@ def new_folder(settings: Settings, at_s: float) -> Path:
     """Create a new folder for this run; raises `RecordingError` if this fails."""
     parent = parent_of(settings)
     stem = time.strftime('valveflow_%Y%m%dT%H%M%SZ', time.gmtime(at_s)) + f'_{tag_of(settings)}'
-    try:
+    with os_errors(parent, 'cannot be made'):
         make_folder(parent)
         for k in range(1, _MOST_NAMES):
             folder = parent / (stem if k == 1 else f'{stem}_{k}')
-            try:
+            with suppress(FileExistsError):
                 folder.mkdir(mode=0o700)
-            except FileExistsError:
-                continue
-            return folder
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(parent, f'cannot be made ({reason})') from None
+                return folder
     raise RecordingError(parent, f"holds {_MOST_NAMES} folders called '{stem}' already")
 
 
