@@ -277,13 +277,12 @@ def test_a_folder_when_the_name_is_no_file(tmp_path):
     folder = tmp_path / 'ten'
     written = write_readings(
         [table_to_readings(wander(10, seed=1))], [], folder, definitions=STOCK, prefix='/u1/',
-        attachments={'truth.json': b'{}'}, metadata={'simulation': {'seed': '1'}},
+        attachments={'truth.json': b'{}'},
     )  # fmt: skip
     assert written.path == folder / 'ten_0.mcap'
     contents = open_log(folder)
     assert set(contents.topics) == {f'/u1/{info.topic}' for info in SIGNALS[:4]}
     assert contents.attachments == {'truth.json': b'{}'}
-    assert contents.metadata['simulation'] == {'seed': '1'}
     assert information(folder)['message_count'] == written.messages
     assert modes_in(folder) == {0o600}
 

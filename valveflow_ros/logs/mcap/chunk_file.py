@@ -177,12 +177,10 @@ class ChunkFile:
         )  # fmt: skip
         self._index[Opcode.ATTACHMENT_INDEX].append(pack(index))
 
-    def put_all(self, files: Mapping[str, bytes], notes: Mapping[str, Mapping[str, str]]) -> None:
-        """Write attachments and metadata records, given by name."""
+    def put_all(self, files: Mapping[str, bytes]) -> None:
+        """Write attachments, given by name."""
         for name, data in files.items():
             self.put_attachment(attachment(name, data))
-        for name, items in notes.items():
-            self.put_metadata(name, items)
 
     def put_metadata(self, name: str, items: Mapping[str, str]) -> None:
         """Write a metadata record."""

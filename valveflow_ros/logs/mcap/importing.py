@@ -23,7 +23,7 @@ from valveflow_ros.logs.mcap import folder
 from valveflow_ros.logs.mcap.chunk_file import CHUNK_BYTES, ChunkFile, compressor, pack_content
 from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.logs.mcap.records import HEAD_DTYPE, RECORD_HEAD
-from valveflow_ros.logs.mcap.writer import Metadata, TopicRegistry
+from valveflow_ros.logs.mcap.writer import TopicRegistry
 from valveflow_ros.logs.names import FLOAT64
 from valveflow_ros.logs.part_file import new_file
 from valveflow_ros.logs.source import os_errors
@@ -71,7 +71,6 @@ def write_readings(
     *,
     prefix: str = '',
     attachments: Mapping[str, bytes] | None = None,
-    metadata: Metadata | None = None,
     definitions: Definitions | None = None,
     overwrite: bool = False,
     further: Sequence[str] = (),
@@ -88,7 +87,7 @@ def write_readings(
         A file if it ends in ``.mcap``; otherwise a folder like that of rosbag2.
     prefix : str
         Namespace before the topics, such as ``/unit1``.
-    attachments, metadata, definitions
+    attachments, definitions
         As in `RecordingWriter`.
     overwrite : bool
         Replace an existing file.
@@ -118,7 +117,7 @@ def write_readings(
     with os_errors(target, 'cannot be written'):
         with new_file(target) as out:
             file = ChunkFile(out, folder.LIBRARY)
-            file.put_all(attachments or {}, metadata or {})
+            file.put_all(attachments or {})
             packer = compressor()
             for part in chain([first], parts):
                 table = book.packed() if file.table_due(len(book.ids)) else b''

@@ -123,7 +123,6 @@ class TopicRegistry:
 _SPLITS_APART, _NUMBERS_APART = 64, 1 << 26
 
 OpenFile = Callable[[Path], PartFile]
-Metadata = Mapping[str, Mapping[str, str]]
 
 
 class Message(NamedTuple):
@@ -175,8 +174,8 @@ class RecordingWriter:
         Splits are named ``NAME_0.mcap``, ...; by default the name of the folder.
     definitions : Definitions, optional
         Source of the message definitions.
-    attachments, metadata : mapping of str
-        Files to attach to every split (parameters, model), and its metadata records.
+    attachments : mapping of str
+        Files to attach to every split, such as parameters and model.
     head_messages : callable
         Returns the latched messages that are repeated at the start of every split but the first.
     open_file : callable
@@ -195,14 +194,12 @@ class RecordingWriter:
         name: str | None = None,
         definitions: Definitions | None = None,
         attachments: Mapping[str, bytes] | None = None,
-        metadata: Metadata | None = None,
         head_messages: Callable[[], Iterable[Message]] = tuple,
         open_file: OpenFile = PartFile,
     ) -> None:
         self.folder = Path(folder)
         self.name = name or self.folder.resolve().name
         self.attachments: dict[str, bytes] = dict(attachments or {})
-        self.metadata: dict[str, Mapping[str, str]] = dict(metadata or {})
         self.lost = self.removed = self.bytes_finished = self.files_finished = 0
         self.loss = ''
         self.path: Path | None = None
@@ -395,7 +392,7 @@ class RecordingWriter:
             out = self._open_file(self.path)
             try:
                 file = ChunkFile(out, splits.LIBRARY)
-                file.put_all(self.attachments, self.metadata)
+                file.put_all(self.attachments)
                 if self._begun:
                     self._repeat(file)
             except OSError:
