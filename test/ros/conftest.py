@@ -46,6 +46,16 @@ def listener(context: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
+def speaker(context: Any) -> Iterator[Any]:
+    """Give a node that says what a monitor says."""
+    from test_ros_watch import Speaker
+
+    made = Speaker(context)
+    yield made
+    made.destroy_node()
+
+
+@pytest.fixture
 def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Processes]:
     """Give a way to start processes in the test's own domain."""
     made = Processes(ros_environment, tmp_path)

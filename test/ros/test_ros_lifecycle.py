@@ -13,13 +13,12 @@ from typing import Any
 import pytest
 import yaml
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from listener import Listener
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -43,7 +42,7 @@ pytestmark = pytest.mark.ros
 DONE = TransitionCallbackReturn.SUCCESS
 
 
-class Stage:
+class Stage(Listener):
     """A monitor that does nothing by itself, and somebody who talks to it."""
 
     def __init__(self, context: Any, folder: Path, **more: object) -> None:
@@ -56,42 +55,30 @@ class Stage:
         self.monitor = MonitorNode(context=context, parameter_overrides=overrides)
         usual = self.monitor._log
         self.monitor._log = lambda level, text: self.told.append(text) or usual(level, text)
-        self.other = Node('other', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.other)
-        self.health: list[DiagnosticArray] = []
-        self.other.create_subscription(DiagnosticArray, '/diagnostics', self.health.append, 10)
+        super().__init__(context)
 
     def start(self) -> Any:
         assert self.monitor.trigger_configure() == self.monitor.trigger_activate() == DONE
         return self.monitor.session
 
     def turn(self) -> None:
-        """Let the monitor's loop and the other node do a bit of work."""
+        """Let the monitor's loop do a bit of work."""
         self.monitor.step()
         monitor_node.serve_requests(self.monitor, 1.0)
-        self.executor.spin_once(timeout_sec=0.01)
 
-    def until(self, condition: Any, what: str) -> Any:
-        return wait_until(lambda: self.turn() or condition(), what, 20.0)
-
-    def ask(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.other.create_client(kind, f'/valveflow_monitor/{name}')
-        wait_until(client.service_is_ready, name, 20.0)
-        future = client.call_async(request)
-        return self.until(lambda: future.done() and future.result(), name)
+    def until(self, condition: Any, what: str, patience_s: float = 20.0) -> Any:
+        return super().until(lambda: self.turn() or condition(), what, patience_s)
 
     def sentence(self, item: str) -> str:
         self.health.clear()
         self.until(lambda: self.health, 'health')
-        found = [s.message for s in self.health[-1].status if s.name.endswith(item)]
-        return found[0] if found else ''
+        found = self.status(item)
+        return found.message if found else ''
 
     def close(self) -> None:
         self.monitor.end_session()
-        self.executor.shutdown()
+        super().close()
         self.monitor.destroy_node()
-        self.other.destroy_node()
 
 
 @pytest.fixture
@@ -117,14 +104,14 @@ def test_the_whole_life(staged: Any, tmp_path: Path) -> None:
     })  # fmt: skip
     monitor = stage.monitor
     best_effort = QoSProfile(depth=3, reliability=ReliabilityPolicy.BEST_EFFORT)
-    power = stage.other.create_publisher(Float64, '/generated_power', best_effort)
+    power = stage.node.create_publisher(Float64, '/generated_power', best_effort)
 
     def reliability(topic: str) -> str:
         (seen,) = monitor.get_subscriptions_info_by_topic(topic)
         return seen.qos_profile.reliability.name.lower()
 
     assert stage.sentence('fit') == 'The monitor is not configured.'
-    answer = stage.ask(Trigger, 'refit', Trigger.Request())
+    answer = stage.call(Trigger, 'refit', Trigger.Request())
     not_active = (False, 'The monitor is not active; activate it first.')
     assert (answer.success, answer.message) == not_active
     for wanted in ('best_effort', 'reliable'):
@@ -137,7 +124,7 @@ def test_the_whole_life(staged: Any, tmp_path: Path) -> None:
         # Each life asks for the reliability of its own parameters; one topic has its override.
         assert reliability('/valve_opening') == wanted
         assert reliability('/main_steam_pressure') == 'reliable'
-        answer = stage.ask(Trigger, 'refit', Trigger.Request())
+        answer = stage.call(Trigger, 'refit', Trigger.Request())
         assert answer.message == 'There is no special segment to fit yet.'
         assert stage.sentence('input valve_opening').startswith('Waiting for /valve_opening')
         unknown = "'qos_overrides./valve_openin.subscription.depth' is for no topic"
@@ -204,7 +191,7 @@ def test_an_active_monitor_answers_all_and_tells_what_it_sees(
 
 def requests_that_wait_are_all_answered_in_one_turn(stage: Stage) -> None:
     names = ('refit', 'acknowledge_alarms')
-    clients = [stage.other.create_client(Trigger, f'/valveflow_monitor/{n}') for n in names]
+    clients = [stage.node.create_client(Trigger, f'/valveflow_monitor/{n}') for n in names]
     wait_until(lambda: all(c.service_is_ready() for c in clients), 'the services', 20.0)
     asked = [client.call_async(Trigger.Request()) for client in clients * 5]
     time.sleep(0.3)  # until all have arrived; nothing takes them meanwhile
@@ -220,21 +207,21 @@ def requests_that_wait_are_all_answered_in_one_turn(stage: Stage) -> None:
 def what_cannot_be_done_is_answered_and_ends_nothing(stage: Stage) -> None:
     # A manager that knows no better asks for a transition that is not to be had.
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-    assert not stage.ask(ChangeState, 'change_state', request).success
+    assert not stage.call(ChangeState, 'change_state', request).success
     strange = ParameterMsg(name='alarm_flood', value=ParameterValue(type=42))
     good = Parameter('alarm_flood', value=7).to_parameter_msg()
     request = SetParameters.Request(parameters=[good, strange, good])
-    results = stage.ask(SetParameters, 'set_parameters', request).results
+    results = stage.call(SetParameters, 'set_parameters', request).results
     assert [result.successful for result in results] == [True, False, False]
     assert 'cannot be done' in results[1].reason
     request = SetParametersAtomically.Request(parameters=[strange])
-    result = stage.ask(SetParametersAtomically, 'set_parameters_atomically', request).result
+    result = stage.call(SetParametersAtomically, 'set_parameters_atomically', request).result
     assert (result.successful, 'cannot be done' in result.reason) == (False, True)
 
 
 def another_node_of_the_same_name_is_told(stage: Stage) -> None:
     assert stage.sentence(' name') == ''
-    twin = Node('valveflow_monitor', context=stage.other.context, start_parameter_services=False)
+    twin = Node('valveflow_monitor', context=stage.node.context, start_parameter_services=False)
     wait_until(lambda: stage.sentence(' name'), 'the name', 20.0)
     assert stage.sentence(' name').startswith('2 nodes are called /valveflow_monitor: ')
     twin.destroy_node()
@@ -242,7 +229,7 @@ def another_node_of_the_same_name_is_told(stage: Stage) -> None:
 
 
 def a_sample_that_does_not_agree_with_the_parameters_is_told_once(stage: Stage) -> None:
-    publisher = stage.other.create_publisher(PlantSample, '/plant_sample', 10)
+    publisher = stage.node.create_publisher(PlantSample, '/plant_sample', 10)
     wait_until(lambda: publisher.get_subscription_count(), 'the subscription', 20.0)
     for second in (1, 2):
         publisher.publish(PlantSample(header=Header(stamp=Time(sec=second), frame_id='U2')))
@@ -255,7 +242,7 @@ def a_curve_is_on_disk_before_anybody_is_told(
     stage: Stage, session: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[int] = []
-    stage.other.create_subscription(
+    stage.node.create_subscription(
         FlowCharacteristic, '/valveflow_monitor/characteristic',
         lambda message: told.append(message.status), 10,
     )  # fmt: skip

@@ -11,7 +11,6 @@ import signal
 import socket
 import threading
 import urllib.request
-from collections.abc import Iterator
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -34,13 +33,6 @@ PAGE = 'valveflow_ros.ros.page_main'
 def port() -> int:
     with socket.create_server(('127.0.0.1', 0)) as free:
         return int(free.getsockname()[1])
-
-
-@pytest.fixture
-def speaker(context) -> Iterator[Speaker]:
-    node = Speaker(context)
-    yield node
-    node.destroy_node()
 
 
 def page_of(port: int, path: str) -> str:

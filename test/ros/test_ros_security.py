@@ -25,7 +25,7 @@ from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import domain, monitor_main, replay_main, simulator_main
 from valveflow_ros.ros.domain import InsecureError, check_security
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.node.parameter_files import given_model, given_reference
+from valveflow_ros.ros.node.parameter_files import given_reference
 from valveflow_ros.ros.node.recording import Recording, new_folder
 
 pytestmark = pytest.mark.ros
@@ -192,13 +192,8 @@ def test_an_unknown_middleware_is_not_trusted_to_refuse(
 
 # Paths
 
-READERS = [('reference_file', given_reference), ('model_file', given_model)]
 
-
-@pytest.mark.parametrize(('name', 'read'), READERS)
-def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(
-    name: str, read: Callable[[Settings], object], tmp_path: Path
-) -> None:
+def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'round').symlink_to(tmp_path / 'round')
     (tmp_path / 'endless').symlink_to('/dev/zero')
@@ -215,9 +210,9 @@ def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(
     ]  # fmt: skip
     for path in given:
         with pytest.raises(ParameterError) as error:
-            within(20.0, lambda: read(Settings({name: path})))  # noqa: B023
+            within(20.0, lambda: given_reference(Settings({'reference_file': path})))  # noqa: B023
         sentence = str(error.value)
-        assert sentence.startswith(f"Parameter '{name}' names '"), path
+        assert sentence.startswith("Parameter 'reference_file' names '"), path
         assert sentence.endswith('.')
         assert '\n' not in sentence
 

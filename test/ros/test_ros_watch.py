@@ -77,13 +77,6 @@ class Speaker(Node):
 
 
 @pytest.fixture
-def speaker(context) -> Iterator[Speaker]:
-    node = Speaker(context)
-    yield node
-    node.destroy_node()
-
-
-@pytest.fixture
 def watch(context, monkeypatch) -> Iterator[WatchNode]:
     usual = Node.__init__
 
