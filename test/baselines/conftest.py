@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Characteristics and data made by hand: everything in them is known."""
 
-from __future__ import annotations
-
 import math
 
 import curves
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 
 from valveflow_ros.baselines.judged import OtherData
-from valveflow_ros.curve.characteristic import Characteristic, RegionDynamics
+from valveflow_ros.curve.characteristic import RegionDynamics
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.records import NS_PER_S, SegmentKind
 
@@ -21,7 +19,7 @@ FIRST_MW = 150.0
 ROWS, SEGMENT = 12_000, 400
 
 
-def characteristic(shift_mw=0.0, exponent=1.125, dynamics=False) -> Characteristic:
+def characteristic(shift_mw=0.0, exponent=1.125, dynamics=False):
     """Return a curve of three pieces, lifted by ``shift_mw``."""
     region = RegionDynamics(100.0, 400.0, 20.0, 2.0, math.nan, math.nan)
     return curves.curve(
@@ -30,7 +28,7 @@ def characteristic(shift_mw=0.0, exponent=1.125, dynamics=False) -> Characterist
     )  # fmt: skip
 
 
-def other_data(noise_mw=1.0, seed=7, shift_mw=0.0, above=9e9, u_shift=0.0) -> OtherData:
+def other_data(noise_mw=1.0, seed=7, shift_mw=0.0, above=9e9, u_shift=0.0):
     """Return rests at many loads, all of them special segments, one in three called a slope.
 
     ``shift_mw`` is added to the power where u is beyond ``above``.

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The comparison as a whole, on data made by hand; the truth of a plant."""
 
-from __future__ import annotations
-
 import copy
 import json
 from dataclasses import replace

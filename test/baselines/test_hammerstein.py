@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Hammerstein baseline: its kernels against obvious loops, and plants of its own class."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

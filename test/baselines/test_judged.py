@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scores of predictions on special segments, who is better than whom, and the tests for it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

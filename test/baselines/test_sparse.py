@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sparse baseline: library, equations, thresholding, simulation and rest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does a characteristic hold on other data."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -9,8 +9,6 @@ import json
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from curves import curve
@@ -35,20 +33,19 @@ class Ran:
     out: str
     err: str
 
-    def done(self) -> Ran:
+    def done(self):
         """Assert that it was done; return it."""
         assert self.status == 0, self.err
         return self
 
     @property
-    def json(self) -> dict[str, Any]:
-        def refuse(word: str) -> None:
+    def json(self):
+        def refuse(word):
             raise AssertionError(f'{word} is no JSON')
 
-        content: dict[str, Any] = json.loads(self.done().out, parse_constant=refuse)
-        return content
+        return json.loads(self.done().out, parse_constant=refuse)
 
-    def refused(self, status: int = 1) -> str:
+    def refused(self, status=1):
         """Assert that it was refused with one sentence (or a list below one); return it."""
         assert self.status == status, self.err
         assert self.out == ''
@@ -69,7 +66,7 @@ class Ran:
 Run = Callable[..., Ran]
 
 
-def run_command(*words: object) -> Ran:
+def run_command(*words):
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         status = main([str(word) for word in words])
@@ -77,12 +74,12 @@ def run_command(*words: object) -> Ran:
 
 
 @pytest.fixture(scope='session')
-def run() -> Run:
+def run():
     return run_command
 
 
 @pytest.fixture(scope='session')
-def logs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def logs(run, tmp_path_factory):
     """Return a folder with one log as plant.csv, .parquet and .mcap, and other days.
 
     Ten hours are long enough for a curve of several pieces, short enough for a test.
@@ -95,23 +92,21 @@ def logs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope='session')
-def identification(
-    run: Run, logs: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Ran, Path]:
+def identification(run, logs, tmp_path_factory):
     """Return what identify said of plant.csv, and its folder."""
     folder = tmp_path_factory.mktemp('identified')
     return run('identify', logs / 'plant.csv', '-o', folder).done(), folder
 
 
 @pytest.fixture(scope='session')
-def identified(identification: tuple[Ran, Path]) -> Path:
+def identified(identification):
     """Return the characteristic.json of the simulated log."""
     return identification[1] / 'characteristic.json'
 
 
 @pytest.fixture
-def write_csv(tmp_path: Path) -> Callable[[str, list[str]], Path]:
-    def write(header: str, rows: list[str]) -> Path:
+def write_csv(tmp_path):
+    def write(header, rows):
         path = tmp_path / 'history.csv'
         path.write_text('\n'.join([header, *rows]) + '\n', encoding='utf-8')
         return path
@@ -120,12 +115,12 @@ def write_csv(tmp_path: Path) -> Callable[[str, list[str]], Path]:
 
 
 @pytest.fixture
-def model(tmp_path: Path) -> Callable[..., Path]:
+def model(tmp_path):
     """Return a writer of curves as files: knots, slopes, and any field of a characteristic."""
 
     def write(
-        name: str = 'model.json', knots=KNOTS, slopes=SLOPES, start: float = 140.0, **fields: Any
-    ) -> Path:  # fmt: skip
+        name='model.json', knots=KNOTS, slopes=SLOPES, start=140.0, **fields
+    ):  # fmt: skip
         made = curve(knots, slopes, start=start, stderr=5e-4, samples=5000)
         content = to_json(replace(made, dynamics=REGIONS, **fields))
         path = tmp_path / name

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands in a log that a verb has written, and tables with one column changed."""
 
-from __future__ import annotations
-
 from valveflow_ros.logs import open_log
 
 

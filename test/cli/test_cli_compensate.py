@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow compensate``: the table, its checks, and what is refused."""
 
-from __future__ import annotations
-
 import csv
 import json
 from functools import partial

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow config``: a file that the monitor takes, and what is wrong with one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,14 +10,14 @@ import yaml
 from valveflow_ros.interface.settings import read_parameters
 from valveflow_ros.parameters import PARAMETERS, Settings
 from valveflow_ros.plant.simulator import simulate
-from valveflow_ros.records import SampleTable, Signal
+from valveflow_ros.records import Signal
 
 
 @pytest.fixture(scope='module')
 def slow_table(tmp_path_factory):
     """A day of the plant, a row every ten seconds, pressure in bar and told so."""
     path = tmp_path_factory.mktemp('config') / 'slow.csv'
-    table: SampleTable = simulate(1.0, 3).table
+    table = simulate(1.0, 3).table
     lines = ['Time (UTC),Valve position [%],Live steam pressure [bar],Live steam temp [degC],MW']
     for k in range(0, len(table), 10):
         u, p, t, w = (table.column(s)[k] for s in list(Signal)[:4])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages, progress and results go where they belong."""
 
-from __future__ import annotations
-
 import io
 import json
 import unicodedata

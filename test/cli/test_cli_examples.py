@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The example in the --help of each verb works as it stands there."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -34,7 +31,7 @@ WRITTEN = {
 }  # fmt: skip
 
 
-def example(page: str) -> list[str]:
+def example(page):
     """Return the words of the first example; what stands behind two spaces is a remark."""
     found = re.search(r'^example:\n  valveflow (.*)$', page, re.M)
     assert found, page
@@ -42,7 +39,7 @@ def example(page: str) -> list[str]:
 
 
 @pytest.fixture
-def plant(tmp_path: Path, logs: Path, identified: Path) -> Path:
+def plant(tmp_path, logs, identified):
     """Return a folder with every file that an example names."""
     for name, source in (
         ('plant.mcap', 'plant.mcap'), ('history.csv', 'plant.csv'), ('other.mcap', 'other.mcap'),

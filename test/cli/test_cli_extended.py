@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs with an extended model: identify, validate and diagnose on top of it."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

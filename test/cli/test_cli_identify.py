@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow identify``: from any log to the curve, its files and its words."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow import``: what historians export, what is seen in it, and what is wrong with it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a table leaves open is said all together, and the last line is the command that works."""
 
-from __future__ import annotations
-
 import json
 import shlex
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ctrl-C at any moment: one sentence, its exit status, nothing half-written."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

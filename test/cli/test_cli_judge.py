@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow diagnose``, ``compare`` and ``validate``: curves held against data."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow simulate``, ``info``, ``export``, ``recover``: logs made, looked at, converted."""
 
-from __future__ import annotations
-
 import json
 import struct
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow loop`` and ``vf.judge_loop``: tables of every kind, columns, what is refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

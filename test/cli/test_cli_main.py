@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command as a whole: help, usage, refusals, exit status, completion, no traceback."""
 
-from __future__ import annotations
-
 import os
 import re
 import resource

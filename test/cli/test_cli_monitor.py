@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow monitor`` and ``fleet``: what the interface found, in words, files and JSON."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

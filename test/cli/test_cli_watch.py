@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow watch``: the verb around the terminal view and the page."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re
@@ -114,7 +112,7 @@ def test_a_recording_on_a_page(tmp_path):
         process.stderr.close()
 
 
-def _metrics(port: int) -> str:
+def _metrics(port):
     with urllib.request.urlopen(f'http://127.0.0.1:{port}/metrics', timeout=10) as answer:
         return answer.read().decode()
 
@@ -145,7 +143,7 @@ def test_without_its_libraries_the_page_is_told_of(run, monkeypatch, tmp_path):
 class Terminal:
     """A process on a terminal of its own."""
 
-    def __init__(self, *words: str, **environment: str) -> None:
+    def __init__(self, *words, **environment):
         self.text = ''
         self._master, slave = pty.openpty()
         self.process = subprocess.Popen(
@@ -156,19 +154,19 @@ class Terminal:
         )  # fmt: skip
         os.close(slave)
 
-    def until(self, part: str, patience_s: float = 60.0) -> str:
+    def until(self, part, patience_s=60.0):
         end_s = time.monotonic() + patience_s
         while part not in self.last():
             assert time.monotonic() < end_s, f'{part!r} did not come: {self.text[-2000:]!r}'
             self._take()
         return self.last()
 
-    def last(self) -> str:
+    def last(self):
         """Return what was drawn last, without colours."""
         frame = self.text.rsplit('\x1b[H', 1)[-1]
         return re.sub(r'\r\n +', ' ', re.sub(r'\x1b\[[0-9;]*[A-Za-z]', '', frame))
 
-    def end(self, number: int) -> int:
+    def end(self, number):
         self.process.send_signal(number)
         try:
             while self.process.poll() is None or select.select([self._master], [], [], 0)[0]:
@@ -178,7 +176,7 @@ class Terminal:
         os.close(self._master)
         return self.process.wait(timeout=30)
 
-    def _take(self) -> None:
+    def _take(self):
         if select.select([self._master], [], [], 0.1)[0]:
             self.text += os.read(self._master, 65536).decode(errors='replace')
 

@@ -2,15 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes the calls by which one thread changes the disk fail, one after the other."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 # Every call of the operating system that a recorder's thread makes to change the disk.
 CALLS = (
@@ -35,19 +31,19 @@ class Faults:
         The calls after it succeed.
     """
 
-    def __init__(self, thread: str, first: int, error: int, once: bool = False) -> None:
+    def __init__(self, thread, first, error, once=False):
         self.calls = 0
-        self.failed_at_s: float | None = None
+        self.failed_at_s = None
         self.what = ''
         self._thread, self._first, self._error = thread, first, error
         self._once, self._healed = once, False
 
-    def heal(self) -> None:
+    def heal(self):
         """Let everything succeed from now on."""
         self._healed = True
 
     @contextmanager
-    def active(self) -> Iterator[None]:
+    def active(self):
         """Stand between the thread and the operating system."""
         real = {name: getattr(os, name) for name in CALLS}
         try:
@@ -58,8 +54,8 @@ class Faults:
             for name, call in real.items():
                 setattr(os, name, call)
 
-    def _between(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        def watched(*arguments: Any, **named: Any) -> Any:
+    def _between(self, name, call):
+        def watched(*arguments, **named):
             if threading.current_thread().name != self._thread:
                 return call(*arguments, **named)
             self.calls += 1
@@ -69,9 +65,7 @@ class Faults:
 
         return watched
 
-    def _fail(
-        self, name: str, call: Callable[..., Any], arguments: Any, named: dict[str, Any]
-    ) -> Any:
+    def _fail(self, name, call, arguments, named):
         if self.failed_at_s is None:
             self.failed_at_s = time.monotonic()
             self.what = name

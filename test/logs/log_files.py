@@ -7,10 +7,8 @@ from __future__ import annotations
 import os
 import struct
 import time
-from collections.abc import Callable, Sequence
 from io import BytesIO
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -19,11 +17,8 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from valveflow_ros.errors import RecordingError
 from valveflow_ros.logs import (
     Definitions,
-    LogContents,
-    Message,
     Recorder,
     RecorderSettings,
-    RecorderStatus,
     RecordingWriter,
     open_log,
 )
@@ -56,18 +51,12 @@ class Told(NamedTuple):
     data: bytes
 
 
-def float64(value: float, order: str = '<') -> bytes:
+def float64(value, order='<'):
     mark = b'\x00\x01\x00\x00' if order == '<' else b'\x00\x00\x00\x00'
     return mark + struct.pack(f'{order}d', value)
 
 
-def plant_sample(
-    stamp_ns: int,
-    values: list[float],
-    quality: list[int],
-    frame_id: str = 'HV101',
-    order: str = '<',
-) -> bytes:
+def plant_sample(stamp_ns, values, quality, frame_id='HV101', order='<'):
     """Encode a PlantSample field by field."""
     body = struct.pack(f'{order}iI', stamp_ns // 10**9, stamp_ns % 10**9)
     text = frame_id.encode() + b'\0'
@@ -77,22 +66,20 @@ def plant_sample(
     return (b'\x00\x01\x00\x00' if order == '<' else b'\x00\x00\x00\x00') + body
 
 
-def read_back(contents: LogContents) -> list[Reading]:
+def read_back(contents):
     r = contents.readings
     columns = contents.log_time_ns, r.time_ns, r.signal, r.value, r.quality
     return [Reading(*row) for row in zip(*(c.tolist() for c in columns), strict=True)]
 
 
-def messages_of(contents: LogContents) -> list[Told]:
+def messages_of(contents):
     return [Told(m.topic, *m[2:]) for m in contents.iter_messages()]
 
 
-def write_chunks(
-    folder: Path, chunks: int = 20, per_chunk: int = 5, close: bool = True
-) -> tuple[Path, list[Reading], RecordingWriter]:
+def write_chunks(folder, chunks=20, per_chunk=5, close=True):
     """Write four Float64 topics; every value and time is told apart from every other."""
     writer = RecordingWriter(folder, definitions=STOCK, attachments={'parameters.yaml': b'a: 1\n'})
-    wanted: list[Reading] = []
+    wanted = []
     for info in SIGNALS[:4]:
         writer.add_topic(f'/unit1/{info.topic}', FLOAT64)
     for step in range(chunks * per_chunk):
@@ -111,16 +98,14 @@ def write_chunks(
     return (path if close else path.with_name(path.name + '.part')), wanted, writer
 
 
-def write_part(folder: Path, chunks: int = 20) -> tuple[Path, list[Reading]]:
+def write_part(folder, chunks=20):
     """Write what `write_chunks` does, and leave it unfinished as a dead writer."""
     part, wanted, writer = write_chunks(folder, chunks, close=False)
     writer.abandon()
     return part, wanted
 
 
-def write_messages(
-    folder: Path, topics: dict[str, str], messages: list[Message], definition: str | None = None
-) -> Path:
+def write_messages(folder, topics, messages, definition=None):
     with RecordingWriter(folder, definitions=STOCK) as writer:
         for topic, type_name in topics.items():
             writer.add_topic(topic, type_name, definition=definition)
@@ -129,14 +114,14 @@ def write_messages(
     return folder / f'{folder.name}_0.mcap'
 
 
-def same_arrays(first: Any, second: Any) -> bool:
+def same_arrays(first, second):
     """Return whether two records of arrays are equal, NaN to NaN."""
     names = list(first.__dataclass_fields__)
     pairs = [(np.asarray(getattr(r, n)) for r in (first, second)) for n in names]
     return all(np.array_equal(a, b, equal_nan=a.dtype.kind == 'f') for a, b in pairs)
 
 
-def wander(n: int, seed: int, command: bool = False) -> SampleTable:
+def wander(n, seed, command=False):
     """Return a table of wandering signals, some of whose values are missing or doubtful."""
     rng = np.random.default_rng(seed)
     time_ns = START_NS + np.cumsum(rng.integers(1, 3_000_000_000, n))
@@ -147,12 +132,12 @@ def wander(n: int, seed: int, command: bool = False) -> SampleTable:
     return SampleTable.from_columns(time_ns, columns, doubts)
 
 
-def stock(file: bytes | Path, seek: bool = True, sort: bool = True) -> list[Told]:
+def stock(file, seek=True, sort=True):
     """Return what the library `mcap` reads, every checksum compared."""
     return [told for told, _ in numbered(file, seek, sort)]
 
 
-def numbered(file: bytes | Path, seek: bool = True, sort: bool = True) -> list[tuple[Told, int]]:
+def numbered(file, seek=True, sort=True):
     """Return the same, each with its sequence number."""
     raw = file if isinstance(file, bytes) else file.read_bytes()
     reader = (SeekingReader if seek else NonSeekingReader)(BytesIO(raw), validate_crcs=True)
@@ -162,7 +147,7 @@ def numbered(file: bytes | Path, seek: bool = True, sort: bool = True) -> list[t
     ]
 
 
-def records(raw: bytes) -> list[tuple[int, int, int]]:
+def records(raw):
     """Return kind, begin and end of every record of an intact file, finished or not."""
     position, found = len(MAGIC), []
     while position < len(raw) - len(MAGIC):
@@ -173,20 +158,18 @@ def records(raw: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def chunk_ends(raw: bytes) -> list[int]:
+def chunk_ends(raw):
     """Return where each chunk ends."""
     return [end for op, _, end in records(raw) if op == Opcode.CHUNK]
 
 
-def record_heads(raw: bytes) -> list[int]:
+def record_heads(raw):
     """Return every byte that belongs to the kind or the length of a record."""
     size = RECORD_HEAD.size
     return [place for _, begin, _ in records(raw) for place in range(begin, begin + size)]
 
 
-def against_chunks(
-    found: Sequence[Any], wanted: Sequence[Any], per_chunk: int
-) -> tuple[int, list[Any]]:
+def against_chunks(found, wanted, per_chunk):
     """Return how many whole chunks are missing, and what was found that is in no whole chunk."""
     left, missing = list(found), 0
     for first in range(0, len(wanted), per_chunk):
@@ -198,32 +181,32 @@ def against_chunks(
     return missing, left
 
 
-def wait_for(condition: Callable[[], object]) -> None:
+def wait_for(condition):
     end_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end_s, 'waited in vain'
         time.sleep(0.001)
 
 
-def recorder_of(folder: Path, settings: RecorderSettings = QUICK, **more: Any) -> Recorder:
+def recorder_of(folder, settings=QUICK, **more):
     recorder = Recorder(folder, settings, definitions=STOCK, **more)
     recorder.add_topic('/valve_opening', FLOAT64)
     return recorder
 
 
-def record(recorder: Recorder, first: int, count: int = 1, topic: str = '/valve_opening') -> None:
+def record(recorder, first, count=1, topic='/valve_opening'):
     """Hand in messages whose values are their numbers, one each nanosecond."""
     for number in range(first, first + count):
         recorder.record(topic, float64(number), START_NS + number, START_NS + number)
 
 
-def put(recorder: Recorder, first: int, count: int = 1) -> None:
+def put(recorder, first, count=1):
     """Do the same and wait until all before are on disk, too."""
     record(recorder, first, count)
     wait_for(lambda: recorder.status().written == first + count)
 
 
-def rotate(recorder: Recorder) -> None:
+def rotate(recorder):
     """Write what waits and begin a new split."""
     wait_for(lambda: recorder.status().queued == 0)
     finished = recorder.status().files_finished
@@ -231,12 +214,12 @@ def rotate(recorder: Recorder) -> None:
     wait_for(lambda: recorder.status().files_finished > finished)
 
 
-def balanced(status: RecorderStatus) -> bool:
+def balanced(status):
     columns = status.written + status.queued + status.lost + status.removed
     return status.received == columns + sum(status.dropped.values())
 
 
-def values_in(folder: Path) -> list[float]:
+def values_in(folder):
     """Return the values of the one topic that a reader finds."""
     try:
         return open_log(folder).readings.value.tolist()
@@ -244,9 +227,9 @@ def values_in(folder: Path) -> list[float]:
         return []
 
 
-def numbers_in_chunks(raw: bytes) -> list[int]:
+def numbers_in_chunks(raw):
     """Return the number of messages of each chunk, by the indexes that follow it."""
-    counts: list[int] = []
+    counts = []
     for op, begin, end in records(raw):
         if op == Opcode.CHUNK:
             counts.append(0)

@@ -73,7 +73,7 @@ class Kind:
     empty: bool = False
     shuffled: bool = False
 
-    def messages(self) -> list[list[Message]]:
+    def messages(self):
         """Return the messages of each chunk."""
         chunks = []
         for chunk in range(self.chunks):
@@ -92,7 +92,7 @@ class Kind:
             ])  # fmt: skip
         return chunks
 
-    def truth(self) -> list[Told]:
+    def truth(self):
         """Return what a reader gives, in the order of the log times."""
         names = {channel.id: channel.topic for channel in CHANNELS}
         told = [
@@ -101,35 +101,35 @@ class Kind:
         ]  # fmt: skip
         return sorted(told, key=lambda message: message.log_ns)
 
-    def legal(self) -> bool:
+    def legal(self):
         """Return whether a reader may hope to learn the topics at all."""
         told_late = self.topics == 'summary'
         return not told_late or (self.outside == 'none' and self.summary and self.summary_topics)
 
-    def is_chunk(self, number: int) -> bool:
+    def is_chunk(self, number):
         """Return whether the messages of this number stand in a chunk."""
         return self.outside == 'none' or (self.outside == 'some' and number % 2 == 1)
 
-    def unchecked(self) -> tuple[int, int]:
+    def unchecked(self):
         """Return how many chunks have no checksum, and how many messages stand outside."""
         made = [self.is_chunk(number) for number in range(self.chunks)]
         chunks = 0 if self.chunk_crc else sum(made) + (self.topics == 'own')
         return chunks, 4 * len(CHANNELS) * (len(made) - sum(made))
 
-    def write(self) -> bytes:
+    def write(self):
         """Return the file."""
         return _File(self).whole()
 
 
 class _File:
-    def __init__(self, kind: Kind) -> None:
+    def __init__(self, kind):
         self.kind = kind
         self.out = bytearray(MAGIC)
-        self.indexes: dict[Opcode, list[bytes]] = {
+        self.indexes = {
             Opcode.CHUNK_INDEX: [], Opcode.ATTACHMENT_INDEX: [], Opcode.METADATA_INDEX: [],
         }  # fmt: skip
 
-    def whole(self) -> bytes:
+    def whole(self):
         kind, tables = self.kind, pack(SCHEMA, *CHANNELS)
         self.put(Header(profile='', library='test'))
         self.extra('a')
@@ -150,7 +150,7 @@ class _File:
         self.finish()
         return bytes(self.out)
 
-    def put(self, *records: object) -> None:
+    def put(self, *records):
         for record in records:
             raw = pack(record)
             if self.kind.longer:
@@ -160,7 +160,7 @@ class _File:
             self.out += raw
             self.out += FOREIGN if self.kind.foreign else b''
 
-    def extra(self, name: str) -> None:
+    def extra(self, name):
         if not self.kind.extras:
             return
         start, attached = len(self.out), Attachment(
@@ -177,13 +177,13 @@ class _File:
         index = MetadataIndex(offset=start, length=len(self.out) - start, name=name)
         self.indexes[Opcode.METADATA_INDEX].append(pack(index))
 
-    def bare(self, head: bytes, messages: list[Message]) -> None:
+    def bare(self, head, messages):
         self.out += head
         for message in messages:
             self.out += FOREIGN if self.kind.foreign else b''
             self.out += pack(message)
 
-    def chunk(self, head: bytes, messages: list[Message]) -> None:
+    def chunk(self, head, messages):
         kind, places, content = self.kind, {}, bytearray(head)
         for message in messages:
             content += FOREIGN if kind.foreign else b''
@@ -211,7 +211,7 @@ class _File:
             uncompressed_size=len(content),
         )))  # fmt: skip
 
-    def finish(self) -> None:
+    def finish(self):
         kind, start, groups = self.kind, len(self.out), {}
         if kind.summary_topics:
             groups[Opcode.SCHEMA], groups[Opcode.CHANNEL] = pack(SCHEMA), pack(*CHANNELS)

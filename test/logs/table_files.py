@@ -2,11 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small tables as historians write them, for the tests of logs."""
 
-from __future__ import annotations
-
 import zipfile
-from collections.abc import Sequence
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -15,24 +11,24 @@ HEAD = 'time,valve position,ms pressure [MPa],ms temperature,MW'
 ROWS = [f'2026-01-05 12:00:{k:02},50,13,538,{600 + k}' for k in range(20)]
 
 
-def csv(path: Path, rows: Sequence[str] = ROWS, head: str = HEAD, encoding: str = 'utf-8') -> Path:
+def csv(path, rows=ROWS, head=HEAD, encoding='utf-8'):
     """Write a table; ``path`` may be its folder."""
     path = path / 'table.csv' if path.is_dir() else path
     path.write_bytes('\n'.join([head, *rows, '']).encode(encoding))
     return path
 
 
-def timed(*times: object) -> list[str]:
+def timed(*times):
     """Return a row for each time."""
     return [f'{time},50,13,538,{600 + k}' for k, time in enumerate(times)]
 
 
-def ns(times: object) -> list[int]:
+def ns(times):
     """Return UTC times of pandas as ns since 1970."""
     return pd.DatetimeIndex(times).astype('datetime64[ns]').astype('int64').tolist()
 
 
-def workbook(path: Path, *sheets: Sequence[Sequence[object]]) -> Path:
+def workbook(path, *sheets):
     """Write sheets named Sheet, Sheet1, ... of rows."""
     openpyxl = pytest.importorskip('openpyxl')
     pytest.importorskip('python_calamine')
@@ -45,7 +41,7 @@ def workbook(path: Path, *sheets: Sequence[Sequence[object]]) -> Path:
     return path
 
 
-def changed(path: Path, to: Path, end: bytes) -> Path:
+def changed(path, to, end):
     """Write a workbook again with something put at the end of its rows."""
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(to, 'w', zipfile.ZIP_DEFLATED) as new:
         for name in old.namelist():

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording is followed while it grows, and its end is read alone: every message once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every legal kind of MCAP recording: reader, `info` and `recover` against the library `mcap`."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections import Counter

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a monitor said, as tables: the same in CSV and Parquet, and what the messages say."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

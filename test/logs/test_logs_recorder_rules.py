@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds of a recorder's loop, account and chunks at any speed, on a clock moved by hand."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 from collections import Counter

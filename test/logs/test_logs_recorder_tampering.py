@@ -5,8 +5,6 @@
 The slow truth is the stock reader, after damaged files were recovered.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

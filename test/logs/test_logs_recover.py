@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recovery, part files and small files: nothing is lost wherever the disk fails."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import gc

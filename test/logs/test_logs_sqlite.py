@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags in sqlite3 are read as the same messages in MCAP are."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import tempfile

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One plant, exported in every way: the same values must come of it."""
 
-from __future__ import annotations
-
 import datetime as dt
 import os
 import subprocess

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables that would fill memory or time, and quotes that are not closed, are refused in words."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import itertools
@@ -92,11 +90,11 @@ TEXT_CELLS = ''.join(
 )
 
 
-def relation(number: int, kind: str, target: str) -> str:
+def relation(number, kind, target):
     return f'<Relationship Id="r{number}" Type="{OFFICE}/{kind}" Target="{target}"/>'
 
 
-def parts_of(rows: str, texts: str) -> dict[str, str]:
+def parts_of(rows, texts):
     """Return the parts of a workbook, written by hand."""
     sheet, strings = relation(1, 'worksheet', 'worksheets/sheet1.xml'), 'sharedStrings'
     return {

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Alarms made, fed and operated; and the life of one in obvious steps, the slow truth of them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

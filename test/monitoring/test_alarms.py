@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both alarms: at one desk, where neither hides the other, and through the engine."""
 
-from __future__ import annotations
-
 import itertools
 from contextlib import suppress
 

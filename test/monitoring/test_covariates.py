@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariates in the monitor: held in step with the rows, kept in the window and in its state."""
 
-from __future__ import annotations
-
 import lzma
 from dataclasses import replace
 from pathlib import Path

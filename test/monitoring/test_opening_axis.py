@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A monitor beside a choked valve: curve, prediction, reference and restart over openings."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 
@@ -29,7 +27,7 @@ DAY = 86400 // STEP_S
 
 
 @cache
-def plant(*effects: str):
+def plant(*effects):
     """Return four days of a choked unit without weather, its pressure sliding with the load."""
     unit = unit_of('choked:number=2,vacuum_per_kpa=0')
     table = simulate_thermal(4.0, 3, unit, effects=effects).table
@@ -44,7 +42,7 @@ def fitted(monitor):
 
 
 @cache
-def learnt(axis='auto') -> Monitor:
+def learnt(axis='auto'):
     """Return a monitor that has a curve of the first two days."""
     monitor = Monitor(SETTINGS.changed({'axis': axis}))
     feed_rows(monitor, plant().part(0, 2 * DAY))
@@ -52,11 +50,11 @@ def learnt(axis='auto') -> Monitor:
     return monitor
 
 
-def again(axis='auto') -> Monitor:
+def again(axis='auto'):
     return taken_up(learnt(axis), Monitor(SETTINGS.changed({'axis': axis})))
 
 
-def rms(events) -> float:
+def rms(events):
     found = column(events, 'residual_mw')
     assert np.isfinite(found).sum() > DAY
     return float(np.sqrt(np.nanmean(found**2)))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The curve of health: set by hand or by itself, follows wear, never learns a fault; its alarm."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

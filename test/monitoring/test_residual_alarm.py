@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The residual alarm: against the slow truth, by relations, and by the stories it was made for."""
 
-from __future__ import annotations
-
 import math
 import re
 

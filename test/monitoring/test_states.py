@@ -5,8 +5,6 @@
 A state made with other parameters, or by another version, costs only what depends on them.
 """
 
-from __future__ import annotations
-
 import copy
 import lzma
 import math

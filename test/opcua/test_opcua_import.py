@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`valveflow import opcua://`: the history of a real server as a log, stopped and taken up."""
 
-from __future__ import annotations
-
 import datetime
 import importlib.util
 import time

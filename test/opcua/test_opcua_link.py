@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The link against real servers in other processes: security, outages, history, odd values."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import importlib.util
@@ -24,7 +22,7 @@ from opcua_server import (
 
 from valveflow_ros.opcua.link import Link
 from valveflow_ros.opcua.mapping import read_mapping_file
-from valveflow_ros.opcua.sampler import Sample, Sampler
+from valveflow_ros.opcua.sampler import Sampler
 from valveflow_ros.opcua.session import check_installed, history
 from valveflow_ros.records import SIGNALS, Quality
 
@@ -41,7 +39,7 @@ class Running:
         check_installed()
         self.unit = read_mapping_file(write_mapping(folder, content)).units[0]
         self.sampler = Sampler(self.unit, time.time_ns())
-        self.samples: list[Sample] = []
+        self.samples = []
         self.saved = []
         self._lock = threading.Lock()
         self._loop = asyncio.new_event_loop()

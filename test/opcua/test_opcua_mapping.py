@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mapping file: what it gives, and the sentence for each thing that cannot be used."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 
@@ -47,7 +45,7 @@ def test_the_example_is_one_that_is_taken(tmp_path):
     assert found.server.security.trusted == (tmp_path / 'dcs.der',)
 
 
-def changed(*keys: str | int, to: object) -> dict:
+def changed(*keys, to):
     content = copy.deepcopy(mapping(4840))
     place = content
     for key in keys[:-1]:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples from changes: which value counts when, what is bad, and stamps that never go back."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -2,22 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page's server, where its libraries are installed."""
 
-from __future__ import annotations
-
 import importlib.util
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
-
-from valveflow_ros.page.unit import Shown
 
 EXTRA = ('dash', 'prometheus_client', 'waitress')
 
 
 @contextmanager
-def servers() -> Iterator[Callable[..., Any]]:
+def servers():
     """Give a function that starts a server on any free port; skip where the extra is absent."""
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
@@ -26,7 +20,7 @@ def servers() -> Iterator[Callable[..., Any]]:
 
     made = []
 
-    def start(shown: Shown, port: int = 0, **more: Any) -> PageServer:
+    def start(shown, port=0, **more):
         made.append(PageServer(shown, port=port, **more))
         return made[-1]
 
@@ -36,14 +30,14 @@ def servers() -> Iterator[Callable[..., Any]]:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Any]]:
+def serve():
     """Start servers for one test."""
     with servers() as start:
         yield start
 
 
 @pytest.fixture(scope='module')
-def serve_long() -> Iterator[Callable[..., Any]]:
+def serve_long():
     """Start servers for the tests of a file."""
     with servers() as start:
         yield start

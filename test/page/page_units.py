@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A unit as the page knows it, told message by message."""
 
-from __future__ import annotations
-
-from typing import Any
-
 from monitor_recording import START_NS, stamp
 
 from valveflow_ros.page.unit import Shown, Unit
@@ -15,11 +11,11 @@ SECOND = 10**9
 NODE = '/valveflow_monitor'
 
 
-def head(time_ns: int, tag: str = 'U1') -> dict[str, Any]:
+def head(time_ns, tag='U1'):
     return {'stamp': stamp(time_ns), 'frame_id': tag}
 
 
-def predict(unit: Unit, second: float, measured: float = 250.0, residual: float = 1.5, **m: Any):
+def predict(unit, second, measured=250.0, residual=1.5, **m):
     expected = measured - residual
     unit.take(PREDICTION, {
         'header': head(START_NS + round(second * SECOND)), 'state': 2, 'integrated_input': 1500.0,
@@ -28,14 +24,14 @@ def predict(unit: Unit, second: float, measured: float = 250.0, residual: float 
     } | m)  # fmt: skip
 
 
-def alarm(unit: Unit, state: int, second: float = 0.0, name: str = 'residual') -> None:
+def alarm(unit, state, second=0.0, name='residual'):
     unit.take(ALARM, {
         'header': head(START_NS + round(second * SECOND)), 'name': name, 'state': state,
         'sentence': 'The unit gives 9 MW less. <b>', 'raised': stamp(START_NS),
     })  # fmt: skip
 
 
-def told(key: str = NODE, tag: str = 'U1', seconds: int = 200) -> Unit:
+def told(key=NODE, tag='U1', seconds=200):
     """Return a unit of which everything was told."""
     unit = Unit(key)
     unit.take(CURVE, {
@@ -70,7 +66,7 @@ def told(key: str = NODE, tag: str = 'U1', seconds: int = 200) -> Unit:
     return unit
 
 
-def shown_now(*units: Unit, note: str = '') -> Shown:
+def shown_now(*units, note=''):
     shown = Shown()
     shown.put([u.snapshot(u.frame(u.key)) for u in units], note)
     return shown

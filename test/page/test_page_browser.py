@@ -2,14 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page in a real browser without a head: drawn, brought up to date, lost and found again."""
 
-from __future__ import annotations
-
 import time
 
 import pytest
 from page_units import alarm, predict, shown_now, told
-
-from valveflow_ros.page.unit import Unit
 
 DESKTOP, PHONE = 1280, 390
 LEAST_PX = 13.9
@@ -71,7 +67,7 @@ def away(browser):
 
 
 @pytest.fixture
-def unit() -> Unit:
+def unit():
     made = told()
     alarm(made, 1, second=199)
     return made

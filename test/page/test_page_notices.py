@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Notices of alarms: in order, tried again, bounded, and never waited for."""
 
-from __future__ import annotations
-
 import json
 import socket
 import sys
@@ -31,12 +29,12 @@ from valveflow_ros.report.terminal.frame import AlarmView
 PATIENCE_S = 20.0
 
 
-def change(state: int = 1, previous: int | None = 0) -> AlarmChange:
+def change(state=1, previous=0):
     view = AlarmView('residual', state, 'Nine MW less – look.', START_NS)
     return AlarmChange('U1', '/m', view, previous, START_NS + 10**9)
 
 
-def until(condition) -> None:
+def until(condition):
     end_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end_s, 'it did not come'

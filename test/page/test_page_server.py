@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page's server: what it answers, what it refuses, and what hostile or slow peers can do."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import math

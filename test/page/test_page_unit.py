@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the page keeps of a unit, bounded and in the plant's time; its metrics for Prometheus."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -19,7 +17,7 @@ from valveflow_ros.report.terminal.frame import SampleView
 BOARD = Path(__file__).resolve().parents[2] / 'config' / 'grafana_board.json'
 
 
-def day_of(*samples: tuple[float, float, float]) -> Day:
+def day_of(*samples):
     """Return a day with samples of (second, measured, residual)."""
     day, nan = Day(), math.nan
     for second, mw, residual in samples:
@@ -109,8 +107,8 @@ def values(text_of):
     """Return a function: each metric as the values by their labels' contents, the unit's first."""
     from prometheus_client.parser import text_string_to_metric_families as families
 
-    def read(shown: Shown) -> dict[str, dict[tuple[str, ...], float]]:
-        found: dict[str, dict[tuple[str, ...], float]] = {}
+    def read(shown):
+        found = {}
         for s in (s for family in families(text_of(shown)) for s in family.samples):
             labels = dict(s.labels)
             key = (labels.pop('unit', ''), *(labels[k] for k in sorted(labels)))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Units that make one thing visible at a time, their runs, and plants at rest."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -11,7 +9,7 @@ import math
 import numpy as np
 from step_plan import StepPlan, step_test
 
-from valveflow_ros.plant.simulator import SimulatedLog, simulate
+from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.spec import EffectSpec
 from valveflow_ros.plant.unit import Noise, Programme, Region, UnitDescription
 
@@ -36,24 +34,24 @@ REST = StepPlan(pressure_wander_mpa=0.0, hold_s=1800.0)
 
 
 @functools.cache
-def run(*effects: str, unit: str = 'paper', days: float = DAYS, seed: int = 1) -> SimulatedLog:
+def run(*effects, unit='paper', days=DAYS, seed=1):
     """Simulate a unit by name with effects by their text; the log is shared: do not change it."""
     return simulate(days, seed, UNITS[unit], effects=[EffectSpec.parse(e) for e in effects])
 
 
 @functools.cache
-def rest(*effects: str) -> SimulatedLog:
+def rest(*effects):
     """Return the step test of the quiet unit."""
     return step_test(1, REST, UNITS['quiet'], effects=[EffectSpec.parse(e) for e in effects])
 
 
-def at_rest(*effects: str) -> np.ndarray:
+def at_rest(*effects):
     """Return the power half a minute before the end of each hold, less that without effects."""
     at = np.round(REST.corners()[0][1::2]).astype(int) - 31
     return rest(*effects).true_power_mw[at] - rest().true_power_mw[at]
 
 
-def same(one: SimulatedLog, other: SimulatedLog) -> None:
+def same(one, other):
     """Assert that two logs are equal bit for bit."""
     np.testing.assert_array_equal(one.table.time_ns, other.table.time_ns)
     np.testing.assert_array_equal(one.table.values, other.table.values)
@@ -62,7 +60,7 @@ def same(one: SimulatedLog, other: SimulatedLog) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def naive_lag(y: float, x0: float, x1: float, time_s: float, h: float = 1.0) -> float:
+def naive_lag(y, x0, x1, time_s, h=1.0):
     """Solve T y' + y = x exactly over one step in which x is straight."""
     if time_s == 0.0:
         return x1

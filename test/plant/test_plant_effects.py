@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effects do what their physics says and nothing else; nothing is nothing, and several compose."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -41,17 +39,17 @@ SOMETHING = {
 }
 
 
-def some(name: str) -> str:
+def some(name):
     return f'{name}:{SOMETHING[name]}'
 
 
 @pytest.mark.parametrize('name', [*catalogue(), 'reheater:time_s=0'])
-def test_an_amplitude_of_nothing_changes_nothing(name: str) -> None:
+def test_an_amplitude_of_nothing_changes_nothing(name):
     same(run(name if ':' in name else f'{name}:{NOTHING[name]}'), run())
 
 
 @pytest.mark.parametrize('name', SOMETHING)
-def test_every_effect_is_seen_and_what_comes_from_outside_stays(name: str) -> None:
+def test_every_effect_is_seen_and_what_comes_from_outside_stays(name):
     log, base = run(some(name)), run()
     assert np.any(log.table.values != base.table.values)
     np.testing.assert_array_equal(log.load_mw, base.load_mw)
@@ -73,7 +71,7 @@ AMPLITUDES = {
 
 
 @pytest.mark.parametrize('name', AMPLITUDES)
-def test_twice_the_amplitude_is_twice_the_difference(name: str) -> None:
+def test_twice_the_amplitude_is_twice_the_difference(name):
     key, amplitude = AMPLITUDES[name]
     none, once, twice = (
         run(f'{name}:{SOMETHING[name]},{key}={a}'.replace(':,', ':'), unit='open').true_power_mw
@@ -88,13 +86,13 @@ def test_twice_the_amplitude_is_twice_the_difference(name: str) -> None:
 
 
 @pytest.mark.parametrize('name', ['gain_step', 'input_step', 'curve_step'])
-def test_nothing_happens_before_the_onset(name: str) -> None:
+def test_nothing_happens_before_the_onset(name):
     log, base, onset = run(some(name)), run(), round(0.1 * 86_400)
     np.testing.assert_array_equal(log.table.values[:onset], base.table.values[:onset])
     assert np.mean(log.true_power_mw[onset:] != base.true_power_mw[onset:]) > 0.3
 
 
-def test_the_order_of_effects_makes_no_difference() -> None:
+def test_the_order_of_effects_makes_no_difference():
     effects = [some(name) for name in NOTHING]
     one, other = run(*effects), run(*effects[::-1])
     # Before rounding, too: the last bit of a product knows the order of its factors.
@@ -103,7 +101,7 @@ def test_the_order_of_effects_makes_no_difference() -> None:
     assert np.isfinite(one.table.values).all()
 
 
-def test_effects_compose() -> None:
+def test_effects_compose():
     names = ('temperature', 'diurnal', 'gain_drift', 'gain_step')
     none = run(unit='prompt').true_power_mw
     ratios = [run(some(name), unit='prompt').true_power_mw / none for name in names]
@@ -114,13 +112,13 @@ def test_effects_compose() -> None:
 # On the curve.
 
 
-def rest_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rest_points():
     """Return u, x and F' u at the holds."""
     curve, u = UNITS['quiet'].curve, REST.corners()[1][1::2] * REST.pressure_mpa**1.125
     return u, curve(u), curve.slopes[np.searchsorted(curve.knots[1:-1], u, side='right')] * u
 
 
-def test_at_rest_the_power_is_the_curve() -> None:
+def test_at_rest_the_power_is_the_curve():
     at = np.round(REST.corners()[0][1::2]).astype(int) - 1
     u, x, _ = rest_points()
     for found, expected in ((rest().true_power_mw, x), (rest().load_mw, x), (rest().true_u, u)):
@@ -128,7 +126,7 @@ def test_at_rest_the_power_is_the_curve() -> None:
     assert np.ptp(rest().true_power_mw[:900]) < 1e-9, 'it begins at rest'
 
 
-def test_gain_and_input_act_in_their_own_load_profile() -> None:
+def test_gain_and_input_act_in_their_own_load_profile():
     u, x, slope_u = rest_points()
     for name, profile in (('gain_step', x), ('input_step', slope_u)):
         change = at_rest(f'{name}:g=0.001,t0_days=0')
@@ -138,7 +136,7 @@ def test_gain_and_input_act_in_their_own_load_profile() -> None:
     assert change[u > 2000.0].max() < 0.15 * change[u < 1200.0].min()
 
 
-def test_shares_and_bumps_of_the_curve_have_their_places_and_add_up() -> None:
+def test_shares_and_bumps_of_the_curve_have_their_places_and_add_up():
     u, _, _ = rest_points()
     lost = at_rest('curve_step:t0_days=0')
     np.testing.assert_allclose(lost, -2.5 * np.clip((u - 1450.0) / 300.0, 0.0, 1.0), atol=1e-6)
@@ -149,7 +147,7 @@ def test_shares_and_bumps_of_the_curve_have_their_places_and_add_up() -> None:
     np.testing.assert_allclose(both, found + lost, atol=1e-9)
 
 
-def test_temperature_and_exponent_follow_what_is_measured() -> None:
+def test_temperature_and_exponent_follow_what_is_measured():
     none, log = (run(*e, unit='prompt') for e in ([], ['temperature:k=-0.001']))
     relative = log.true_power_mw / none.true_power_mw - 1.0
     measured = log.table.column(Signal.MAIN_STEAM_TEMPERATURE)
@@ -162,7 +160,7 @@ def test_temperature_and_exponent_follow_what_is_measured() -> None:
     assert np.polyfit(np.log(pressure / 13.0), factor, 1)[0] == pytest.approx(-0.1, rel=0.01)
 
 
-def test_only_a_nozzle_that_is_not_choked_knows_the_pressure_behind() -> None:
+def test_only_a_nozzle_that_is_not_choked_knows_the_pressure_behind():
     none = run(unit='open')
     np.testing.assert_array_equal(run('choked:kappa=0.01', unit='open').true_u, none.true_u)
     line = OPEN_LOOP.programme.sliding_pressure_mpa(OPEN_LOOP.curve(none.true_u))
@@ -183,7 +181,7 @@ def test_only_a_nozzle_that_is_not_choked_knows_the_pressure_behind() -> None:
         run('choked:kappa=0.06')
 
 
-def test_the_day_wave_peaks_at_its_hour() -> None:
+def test_the_day_wave_peaks_at_its_hour():
     start_h, effect = 9, [EffectSpec.parse('diurnal:a=0.01,peak_h=7')]
     none, log = (
         simulate(1.0, 4, UNITS['prompt'], DEFAULT_START_NS + start_h * 3600 * NS_PER_S, e)
@@ -195,7 +193,7 @@ def test_the_day_wave_peaks_at_its_hour() -> None:
     np.testing.assert_allclose(relative, expected, atol=2e-5)
 
 
-def test_intervals_have_two_levels() -> None:
+def test_intervals_have_two_levels():
     none, log = (run(*e, unit='prompt', days=0.5) for e in ([], [f'intervals:g=-0.02,{OFTEN}']))
     relative = log.true_power_mw / none.true_power_mw - 1.0
     inside = np.zeros(len(log), dtype=bool)
@@ -212,7 +210,7 @@ def test_intervals_have_two_levels() -> None:
 
 
 @pytest.mark.parametrize('name', ['reheater', 'region_lag', 'rate_limit', 'clock'])
-def test_dynamics_are_nothing_at_rest(name: str) -> None:
+def test_dynamics_are_nothing_at_rest(name):
     np.testing.assert_allclose(at_rest(name), 0.0, atol=1e-6)
     change = rest(name).true_power_mw - rest().true_power_mw
     assert np.abs(change).max() > 0.5
@@ -221,7 +219,7 @@ def test_dynamics_are_nothing_at_rest(name: str) -> None:
 
 
 @pytest.mark.parametrize('level', [200.0, 240.0, 270.0])
-def test_region_lag_takes_the_place_of_all_regions_above(level: float) -> None:
+def test_region_lag_takes_the_place_of_all_regions_above(level):
     first, second = UnitDescription().regions
     below = (first,) if level <= first.power_to_mw else (first, second)
     below = (*below[:-1], dataclasses.replace(below[-1], power_to_mw=level))
@@ -230,7 +228,7 @@ def test_region_lag_takes_the_place_of_all_regions_above(level: float) -> None:
 
 
 @pytest.mark.parametrize('seconds', [12.0, -12.0, 2.5])
-def test_the_clock_moves_the_power_only(seconds: float) -> None:
+def test_the_clock_moves_the_power_only(seconds):
     none, log = run(), run(f'clock:d_s={seconds}')
     np.testing.assert_array_equal(log.true_u, none.true_u)
     row = np.arange(20, len(log) - 20)
@@ -240,7 +238,7 @@ def test_the_clock_moves_the_power_only(seconds: float) -> None:
 
 
 @pytest.mark.parametrize('name', ['stiction', 'rate_limit', 'saturation'])
-def test_where_the_sensor_stands(name: str) -> None:
+def test_where_the_sensor_stands(name):
     behind, before = (run(f'{name}:before_sensor={side}') for side in (0, 1))
     # The plant is the same; only what the sensor sees differs.
     np.testing.assert_array_equal(behind.plug_percent, before.plug_percent)
@@ -252,7 +250,7 @@ def test_where_the_sensor_stands(name: str) -> None:
         assert (at_plug < 0.025 < at_command) != hidden
 
 
-def test_the_sensor_does_not_see_the_slack() -> None:
+def test_the_sensor_does_not_see_the_slack():
     log = run('backlash')
     command = log.table.column(Signal.VALVE_COMMAND)
     assert np.std(log.table.column(Signal.VALVE_OPENING) - command) < 0.025
@@ -263,7 +261,7 @@ def test_the_sensor_does_not_see_the_slack() -> None:
 
 
 @pytest.mark.parametrize('topic', ['valve_opening', 'generated_power'])
-def test_a_flat_line_holds_its_first_value(topic: str) -> None:
+def test_a_flat_line_holds_its_first_value(topic):
     log = run(f'flatline:signal={topic},t0_days=0.1,minutes=30')
     expected = run().table.values.copy()
     column = next(info.signal for info in SIGNALS if info.topic == topic)
@@ -271,7 +269,7 @@ def test_a_flat_line_holds_its_first_value(topic: str) -> None:
     np.testing.assert_array_equal(log.table.values, expected)
 
 
-def test_a_coarse_record_knows_multiples_only() -> None:
+def test_a_coarse_record_knows_multiples_only():
     clean, coarse = (
         log.table.column(Signal.GENERATED_POWER) for log in (run(), run('quantisation:step=5'))
     )
@@ -280,7 +278,7 @@ def test_a_coarse_record_knows_multiples_only() -> None:
     assert np.mean(np.diff(coarse) == 0.0) > 0.5 > 0.1 > np.mean(np.diff(clean) == 0.0)
 
 
-def test_spikes_are_where_their_pattern_says() -> None:
+def test_spikes_are_where_their_pattern_says():
     effect = EffectSpec.parse('spikes:per_day=200,height=30,pattern=2')
     unit = UnitDescription(sample_period_s=2.0)
     none, log = (

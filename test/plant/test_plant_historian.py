@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a historian keeps: means, exceptions, dropouts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,7 +13,7 @@ START_NS = 1_700_006_400_000_000_000
 NAMES = ('valve_opening_percent', 'main_steam_pressure_mpa', 'generated_power_mw')
 
 
-def signals() -> dict[str, np.ndarray]:
+def signals():
     """Return walks of the size of plant signals."""
     rng = np.random.default_rng(2)
     sizes = dict(zip(NAMES, (0.1, 0.02, 0.4), strict=True))
@@ -24,14 +22,12 @@ def signals() -> dict[str, np.ndarray]:
     }
 
 
-def record(historian: Historian):
+def record(historian):
     """Record the walks."""
     return historian.record(START_NS, signals(), np.random.default_rng(1))
 
 
-def naive_exceptions(
-    column: list[float], scan: int, phase: int, band: float, longest: int
-) -> list[bool]:
+def naive_exceptions(column, scan, phase, band, longest):
     """Keep what a scan finds outside the band, or when the next scan would be too late."""
     kept = [False] * len(column)
     last = None
@@ -57,21 +53,21 @@ def naive_exceptions(
     st.lists(st.one_of(st.integers(-20, 20), st.just(None)), max_size=80),
     st.integers(1, 7), st.integers(0, 6), st.integers(0, 5), st.integers(7, 30),
 )  # fmt: skip
-def test_the_fast_compression_is_the_slow_one(column, scan, phase, band, longest) -> None:
+def test_the_fast_compression_is_the_slow_one(column, scan, phase, band, longest):
     values = np.array([np.nan if v is None else float(v) for v in column], dtype=np.float64)
     kept = exceptions(values, scan, min(phase, scan - 1), float(band), longest)
     slow = naive_exceptions(values.tolist(), scan, min(phase, scan - 1), float(band), longest)
     assert kept.tolist() == slow
 
 
-def test_every_second_is_kept_as_it_is() -> None:
+def test_every_second_is_kept_as_it_is():
     time_ns, columns = record(Historian())
     np.testing.assert_array_equal(np.diff(time_ns), 1_000_000_000)
     for name, column in signals().items():
         np.testing.assert_array_equal(columns[name], column)
 
 
-def test_a_minute_is_the_plain_mean_stamped_at_its_end() -> None:
+def test_a_minute_is_the_plain_mean_stamped_at_its_end():
     time_ns, columns = record(Historian('minute'))
     assert len(time_ns) == 121, 'a minute that is not full has no mean'
     for name, column in signals().items():
@@ -82,7 +78,7 @@ def test_a_minute_is_the_plain_mean_stamped_at_its_end() -> None:
 
 
 @pytest.mark.parametrize('band', [0.1, 2.0])
-def test_a_scanned_value_lies_within_the_band_of_the_last_one_kept(band: float) -> None:
+def test_a_scanned_value_lies_within_the_band_of_the_last_one_kept(band):
     historian = Historian('compressed', band_percent=band)
     time_ns, columns = record(historian)
     seconds = (time_ns - START_NS) // 1_000_000_000
@@ -104,7 +100,7 @@ def test_a_scanned_value_lies_within_the_band_of_the_last_one_kept(band: float) 
     assert len(time_ns) < 7300 / 2
 
 
-def test_a_wider_band_keeps_less() -> None:
+def test_a_wider_band_keeps_less():
     found = [record(Historian('compressed', band_percent=b))[1] for b in (0.1, 0.5, 2.0)]
     sizes = [np.isfinite(columns[NAMES[2]]).sum() for columns in found]
     assert sizes[0] > sizes[1] > sizes[2] >= 7300 // 600
@@ -112,7 +108,7 @@ def test_a_wider_band_keeps_less() -> None:
 
 
 @pytest.mark.parametrize('step', [5, 60])
-def test_resampled_rows_hold_the_last_value_kept(step: int) -> None:
+def test_resampled_rows_hold_the_last_value_kept(step):
     own_ns, own = record(Historian('compressed'))
     time_ns, columns = record(Historian('compressed', resample_s=float(step)))
     np.testing.assert_array_equal(np.diff(time_ns), step * 1_000_000_000)
@@ -122,7 +118,7 @@ def test_resampled_rows_hold_the_last_value_kept(step: int) -> None:
         np.testing.assert_array_equal(columns[name], own[name][here][places])
 
 
-def test_dropouts_take_values_away_and_change_none() -> None:
+def test_dropouts_take_values_away_and_change_none():
     lossy = {'dropouts_per_day': 60.0, 'dropout_minutes': 3.0}
     _, columns = record(Historian(**lossy))
     _, minutes = record(Historian('minute', **lossy))
@@ -139,14 +135,14 @@ def test_dropouts_take_values_away_and_change_none() -> None:
     assert not np.array_equal(missing[0], missing[1]), 'each signal drops out by itself'
 
 
-def test_after_a_dropout_the_first_scan_is_kept() -> None:
+def test_after_a_dropout_the_first_scan_is_kept():
     column = np.zeros(400)
     column[100:200] = np.nan
     kept = np.flatnonzero(exceptions(column, 10, 3, 1.0, 600))
     assert kept.tolist() == [3, 203]
 
 
-def test_a_historian_is_read_from_its_text() -> None:
+def test_a_historian_is_read_from_its_text():
     assert Historian.parse('minute') == Historian('minute')
     assert Historian.parse(' compressed: band_percent=1, longest_s=300') == Historian(
         'compressed', band_percent=1.0, longest_s=300.0

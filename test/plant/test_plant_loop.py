@@ -39,7 +39,7 @@ class Faults:
     reheat_s: float = 0.0
 
 
-def naive_curve(unit: UnitDescription, u: float) -> float:
+def naive_curve(unit, u):
     """Evaluate eq. (2) piece by piece."""
     curve = unit.curve
     for j in range(len(curve.slopes)):
@@ -48,7 +48,7 @@ def naive_curve(unit: UnitDescription, u: float) -> float:
     raise AssertionError
 
 
-def naive_inverse(unit: UnitDescription, x: float) -> float:
+def naive_inverse(unit, x):
     """Solve F(u) = x by halving."""
     low, high = 0.0, 10_000.0
     for _ in range(60):
@@ -57,10 +57,10 @@ def naive_inverse(unit: UnitDescription, x: float) -> float:
     return 0.5 * (low + high)
 
 
-def naive_at(history: list[float], index: float, first: float) -> float:
+def naive_at(history, index, first):
     """Read a history between samples; before its begin it was ``first``."""
 
-    def get(i: int) -> float:
+    def get(i):
         return history[i] if i >= 0 else first
 
     whole = math.floor(index)
@@ -71,13 +71,13 @@ def naive_at(history: list[float], index: float, first: float) -> float:
     )
 
 
-def naive_psi(ratio: float) -> float:
+def naive_psi(ratio):
     """Return the ellipse of sub-critical flow."""
     critical = 0.546
     return 1.0 if ratio < critical else math.sqrt(1 - ((ratio - critical) / (1 - critical)) ** 2)
 
 
-def naive_plug(wanted: float, memory: list[float], h: float, faults: Faults) -> float:
+def naive_plug(wanted, memory, h, faults):
     """Pass an opening through servo, friction, stop and slack."""
     limit = faults.speed * h
     memory[0] += min(max(wanted - memory[0], -limit), limit)
@@ -92,7 +92,7 @@ def naive_plug(wanted: float, memory: list[float], h: float, faults: Faults) -> 
     return memory[2]
 
 
-def naive_plant(unit: UnitDescription, days: float, seed: int, faults: Faults) -> np.ndarray:
+def naive_plant(unit, days, seed, faults):
     """Run the plant of the paper row by row; columns command, plug, u, power."""
     h, plan = unit.sample_period_s, unit.programme
     skip, rows = round(WARM_UP_S / h), round(days * DAY_S / h)
@@ -101,8 +101,8 @@ def naive_plant(unit: UnitDescription, days: float, seed: int, faults: Faults) -
     noise = Disturbance(unit, seed).advance(outside.load_mw)
     first = float(outside.load_mw[0])
     correction, direct, reheated = 0.0, first, first
-    memory: list[float] = []
-    flow: list[float] = []
+    memory = []
+    flow = []
     out = []
     for t in range(skip + rows):
         load, p = float(outside.load_mw[t]), float(outside.pressure_mpa[t])
@@ -141,7 +141,7 @@ EVERYTHING_SPECS = ('backlash', 'stiction', 'rate_limit', 'saturation', 'reheate
 
 @pytest.mark.parametrize('number', [None, 1, 3])
 @pytest.mark.parametrize('faulty', [False, True])
-def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None:
+def test_the_fast_loop_is_the_slow_one(number, faulty):
     rng = np.random.default_rng(number)
     unit = UnitDescription() if number is None else random_unit(rng)
     plan = unit.programme
@@ -161,7 +161,7 @@ def test_the_fast_loop_is_the_slow_one(number: int | None, faulty: bool) -> None
 
 @pytest.mark.parametrize('step_s', [0.5, 1.0, 7.0])
 @pytest.mark.parametrize('time_s', [0.5, 80.0])
-def test_a_ramp_is_answered_late_by_its_time_constant(step_s: float, time_s: float) -> None:
+def test_a_ramp_is_answered_late_by_its_time_constant(step_s, time_s):
     a, b, c = lag_coefficients(time_s, step_s)
     ramp = np.arange(0.0, 20.0 * time_s + 10.0 * step_s, step_s)
     y = ramp[0]
@@ -170,7 +170,7 @@ def test_a_ramp_is_answered_late_by_its_time_constant(step_s: float, time_s: flo
     assert y == pytest.approx(ramp[-1] - time_s, rel=1e-6, abs=1e-6 * time_s)
 
 
-def test_sampling_twice_as_often_gives_the_same_plant() -> None:
+def test_sampling_twice_as_often_gives_the_same_plant():
     # Noise would differ from rate to rate; a manual step test has none here.
     plan = StepPlan(pressure_wander_mpa=0.0, steps=4, hold_s=600.0)
     one, two = (
@@ -190,7 +190,7 @@ paths = st.lists(st.floats(0.0, 100.0, width=32), min_size=1, max_size=60)
 widths = st.floats(0.0, 5.0, width=32)
 
 
-def through(path: list[float], step_s: float = 1.0, **limits: float) -> np.ndarray:
+def through(path, step_s=1.0, **limits):
     """Send a path through a bank that rests at its first value."""
     settings = loop.settings(ActuatorLimits(**limits), step_s)
     positions = np.full(loop.N_POSITIONS, path[0])
@@ -198,9 +198,7 @@ def through(path: list[float], step_s: float = 1.0, **limits: float) -> np.ndarr
 
 
 @given(paths, widths, st.integers(2, 5))
-def test_play_stays_within_half_its_width_at_any_speed(
-    path: list[float], width: float, times: int
-) -> None:
+def test_play_stays_within_half_its_width_at_any_speed(path, width, times):
     fast = through(path, slack_percent=width)
     assert np.all(np.abs(fast - path) <= width / 2 + 1e-9)
     # Straight between its points and slower by a factor: the same at the points.
@@ -211,7 +209,7 @@ def test_play_stays_within_half_its_width_at_any_speed(
 
 
 @given(paths, widths, st.floats(0.0, 1.0))
-def test_a_sticking_valve_stays_or_jumps(path: list[float], band: float, share: float) -> None:
+def test_a_sticking_valve_stays_or_jumps(path, band, share):
     jump = share * band
     position = through(path, band_percent=band, jump_percent=jump)
     moves = np.abs(np.diff(position))
@@ -220,7 +218,7 @@ def test_a_sticking_valve_stays_or_jumps(path: list[float], band: float, share: 
 
 
 @given(paths, st.floats(0.1, 10.0), st.sampled_from([0.5, 2.0]), st.floats(1.0, 100.0))
-def test_rate_and_stop_are_kept(path: list[float], rate: float, step_s: float, top: float) -> None:
+def test_rate_and_stop_are_kept(path, rate, step_s, top):
     position = through([*path, *[50.0] * 2_000], step_s, rate_percent_per_s=rate)
     assert np.all(np.abs(np.diff(position)) <= rate * step_s + 1e-9)
     assert position[-1] == 50.0, 'it ends where it is sent if it is given the time'

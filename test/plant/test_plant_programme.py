@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The outside of the plant: what the text of the paper's study asks for, by counting."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from plants import run, same
@@ -19,11 +17,11 @@ LONG_S = 300.0 * DAY_S
 
 
 @pytest.fixture(scope='module')
-def days() -> SimulatedLog:
+def days():
     return simulate(4.0, seed=20)
 
 
-def test_holds_and_ramps_of_the_load() -> None:
+def test_holds_and_ramps_of_the_load():
     seconds, load = load_knots(np.random.default_rng(1), LONG_S, 0.0, Programme())
     holds, ramps = np.diff(seconds)[0::2], np.diff(seconds)[1::2]
     targets, moves = load[2::2], np.abs(np.diff(load)[1::2])
@@ -39,7 +37,7 @@ def test_holds_and_ramps_of_the_load() -> None:
     assert 0.15 < np.mean(targets >= 286.0) < 0.21
 
 
-def test_the_load_follows_the_clock() -> None:
+def test_the_load_follows_the_clock():
     plan, clock_h = Programme(full_load_share=0.0), 7.0
     seconds, load = load_knots(np.random.default_rng(2), LONG_S, clock_h * 3600.0, plan)
     t = np.arange(0.0, LONG_S, 600.0)
@@ -53,7 +51,7 @@ def test_the_load_follows_the_clock() -> None:
 
 
 @pytest.mark.parametrize('start_h', [0, 9])
-def test_the_clock_is_read_from_the_stamps(start_h: int) -> None:
+def test_the_clock_is_read_from_the_stamps(start_h):
     unit, hour_ns = UnitDescription(), 3600 * NS_PER_S
     log = simulate(0.5, 3, start_ns=DEFAULT_START_NS + start_h * hour_ns)
     # The record begins an hour after the plant does.
@@ -61,7 +59,7 @@ def test_the_clock_is_read_from_the_stamps(start_h: int) -> None:
     np.testing.assert_array_equal(log.load_mw, drive.advance(0, 13 * 3600).load_mw[3600:])
 
 
-def test_pulses_of_primary_frequency_control() -> None:
+def test_pulses_of_primary_frequency_control():
     pulses = Pulses.draw(np.random.default_rng(3), LONG_S, Programme())
     assert pulses.start_s.size == pytest.approx(LONG_S / 1500.0, rel=0.05)
     height = np.abs(pulses.height_percent)
@@ -75,7 +73,7 @@ def test_pulses_of_primary_frequency_control() -> None:
     np.testing.assert_allclose(shown, [0, 0, -1, -2, -2, -2, -1, 0, 0])
 
 
-def test_ranges_of_the_paper_unit(days: SimulatedLog) -> None:
+def test_ranges_of_the_paper_unit(days):
     values = days.table.values
     opening, pressure, temperature, power, _ = values.T
     np.testing.assert_allclose(opening * pressure**1.125, days.true_u, rtol=0.01)
@@ -92,7 +90,7 @@ def test_ranges_of_the_paper_unit(days: SimulatedLog) -> None:
     assert opening.max() < 100.2
 
 
-def test_noise_of_the_power(days: SimulatedLog) -> None:
+def test_noise_of_the_power(days):
     noise = days.noise_mw
     assert noise.std() == pytest.approx(np.hypot(2.0, 2.2), rel=0.03)
     one_minute = np.mean(noise[60:] * noise[:-60])
@@ -102,7 +100,7 @@ def test_noise_of_the_power(days: SimulatedLog) -> None:
     )
 
 
-def test_noise_and_rounding_of_the_sensors(days: SimulatedLog) -> None:
+def test_noise_and_rounding_of_the_sensors(days):
     values = days.table.values
     error = values[:, Signal.VALVE_OPENING] - days.plug_percent
     assert error.std() == pytest.approx(0.02, rel=0.05)
@@ -117,14 +115,14 @@ def test_noise_and_rounding_of_the_sensors(days: SimulatedLog) -> None:
         assert np.diff(values[:, signal]).std() == pytest.approx(np.sqrt(2) * sigma, rel=0.4)
 
 
-def test_the_record_begins_in_equilibrium() -> None:
+def test_the_record_begins_in_equilibrium():
     starts = [simulate(0.02, seed) for seed in range(20)]
     error = [np.mean(s.true_power_mw[:60] - s.load_mw[:60]) for s in starts]
     assert np.std(error) < 4.0
     assert abs(np.mean(error)) < 1.5
 
 
-def test_the_power_control_removes_a_lasting_error() -> None:
+def test_the_power_control_removes_a_lasting_error():
     effect = [EffectSpec.parse('output_offset_drift:b_mw=50')]
     error = {}
     for feedback in (False, True):
@@ -138,7 +136,7 @@ def test_the_power_control_removes_a_lasting_error() -> None:
 
 
 @pytest.mark.parametrize('wanted', [0.0, 0.8])
-def test_temperature_and_pressure_correlate_as_asked(wanted: float) -> None:
+def test_temperature_and_pressure_correlate_as_asked(wanted):
     plan = Programme(
         temperature_pressure_correlation=wanted, load_daily_mw=0.0, load_spread_mw=0.1,
         full_load_share=0.0,
@@ -149,7 +147,7 @@ def test_temperature_and_pressure_correlate_as_asked(wanted: float) -> None:
     assert np.corrcoef(pressure, temperature)[0, 1] == pytest.approx(wanted, abs=0.12)
 
 
-def test_noise_by_load_and_a_slow_wander_change_the_noise_alone() -> None:
+def test_noise_by_load_and_a_slow_wander_change_the_noise_alone():
     base = run(days=0.3)
     log = simulate(0.3, 1, UnitDescription(noise=Noise(load_dependence=0.8)))
     expected = 1.0 + 0.8 * (log.load_mw - 228.0) / (293.5 - 228.0)
@@ -159,7 +157,7 @@ def test_noise_by_load_and_a_slow_wander_change_the_noise_alone() -> None:
     assert np.mean(added[600:] * added[:-600]) / np.mean(added**2) > 0.8
 
 
-def test_the_seed_decides_everything_and_a_longer_run_begins_with_the_shorter_one() -> None:
+def test_the_seed_decides_everything_and_a_longer_run_begins_with_the_shorter_one():
     effects = ('clock:d_s=2.5', 'spikes:per_day=300', 'diurnal')
     short, long = (run(*effects, days=days, seed=8) for days in (0.1, 0.2))
     n = len(short)
@@ -171,7 +169,7 @@ def test_the_seed_decides_everything_and_a_longer_run_begins_with_the_shorter_on
 
 @pytest.mark.parametrize('part_s', [61.0, 5000.0, np.inf])
 @pytest.mark.parametrize('lead', ['7.5', '-7.5'])
-def test_any_cutting_into_parts_gives_the_same_run(part_s: float, lead: str) -> None:
+def test_any_cutting_into_parts_gives_the_same_run(part_s, lead):
     texts = (
         f'clock:d_s={lead}', 'flatline:t0_days=0.02,minutes=60,signal=valve_opening', 'backlash',
         'stiction:before_sensor=1', 'rate_limit', 'reheater', 'curve_step:t0_days=0.03',
@@ -183,7 +181,7 @@ def test_any_cutting_into_parts_gives_the_same_run(part_s: float, lead: str) -> 
     same(SimulatedLog.joined(parts), whole)
 
 
-def test_stamps_follow_the_sample_period() -> None:
+def test_stamps_follow_the_sample_period():
     log = simulate(0.01, 1, UnitDescription(sample_period_s=2.0), start_ns=5 * NS_PER_S)
     np.testing.assert_array_equal(log.table.time_ns, (5 + 2 * np.arange(432)) * NS_PER_S)
     assert DEFAULT_START_NS % int(DAY_S * NS_PER_S) == 0, 'a midnight'

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What cannot be simulated is refused in one sentence: effects, units, runs and records."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 
@@ -155,7 +153,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(('make', 'given', 'more', 'said'), REFUSED)
-def test_what_cannot_be_simulated_is_refused(make, given, more, said: str) -> None:
+def test_what_cannot_be_simulated_is_refused(make, given, more, said):
     with pytest.raises(InputError) as caught:
         make(*given, **more)
     assert re.search(said, str(caught.value)), caught.value
@@ -163,7 +161,7 @@ def test_what_cannot_be_simulated_is_refused(make, given, more, said: str) -> No
 
 
 @given(st.text(max_size=40))
-def test_any_text_is_either_an_effect_or_a_sentence(text: str) -> None:
+def test_any_text_is_either_an_effect_or_a_sentence(text):
     for candidate in (text, f'gain_step:{text}', f'gain_step:g={text}'):
         said = ''
         try:

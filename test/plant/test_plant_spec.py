@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effects from what a person writes after --effect, and units other than the paper's."""
 
-from __future__ import annotations
-
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +25,7 @@ NAMES = {
 }  # fmt: skip
 
 
-def test_the_catalogue_has_the_contract_names_and_every_effect_explains_itself() -> None:
+def test_the_catalogue_has_the_contract_names_and_every_effect_explains_itself():
     assert set(catalogue()) == NAMES
     for name, effect in catalogue().items():
         assert len(effect.install.__doc__.split()) > 15, name
@@ -40,7 +37,7 @@ def test_the_catalogue_has_the_contract_names_and_every_effect_explains_itself()
         assert EffectSpec.parse(name).parameters == {r.name: r.default for r in effect.parameters}
 
 
-def test_parse_reads_names_and_values() -> None:
+def test_parse_reads_names_and_values():
     spec = EffectSpec.parse('gain_step:g=-0.01,t0_days=5')
     assert (spec.name, spec.parameters) == ('gain_step', {'g': -0.01, 't0_days': 5.0})
     assert EffectSpec.parse('  gain_step : g = -0.01 , t0_days = 5 ') == spec
@@ -50,10 +47,10 @@ def test_parse_reads_names_and_values() -> None:
 
 
 @st.composite
-def specs(draw: st.DrawFn) -> EffectSpec:
+def specs(draw):
     """Draw an effect with any allowed values."""
     effect = catalogue()[draw(st.sampled_from(sorted(NAMES)))]
-    values: dict = {}
+    values = {}
     for row in effect.parameters:
         if row.choices:
             values[row.name] = draw(st.sampled_from(row.choices))
@@ -71,11 +68,11 @@ def specs(draw: st.DrawFn) -> EffectSpec:
 
 
 @given(specs())
-def test_its_text_is_read_back_as_itself(spec: EffectSpec) -> None:
+def test_its_text_is_read_back_as_itself(spec):
     assert EffectSpec.parse(str(spec)) == spec
 
 
-def test_both_sides_of_the_sensor_are_two_places_and_the_log_says_what_was_active() -> None:
+def test_both_sides_of_the_sensor_are_two_places_and_the_log_says_what_was_active():
     pair = [EffectSpec.of('rate_limit', before_sensor=side) for side in (0, 1)]
     assert simulate(0.1, 1, effects=pair).active == tuple(pair)
 
@@ -99,9 +96,7 @@ EFFECT = Effect(
 """
 
 
-def test_adding_an_effect_is_adding_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_adding_an_effect_is_adding_a_file(tmp_path, monkeypatch):
     (tmp_path / 'own.py').write_text(NEW_FILE)
     monkeypatch.setattr(effects, '__path__', [*effects.__path__, str(tmp_path)])
     catalogue.cache_clear()
@@ -115,7 +110,7 @@ def test_adding_an_effect_is_adding_a_file(
 
 
 @pytest.mark.parametrize('number', range(8))
-def test_other_units_are_plausible(number: int) -> None:
+def test_other_units_are_plausible(number):
     unit = random_unit(np.random.default_rng(number))
     curve, plan = unit.curve, unit.programme
     ratio = curve.slopes[1:] / curve.slopes[:-1]
@@ -130,7 +125,7 @@ def test_other_units_are_plausible(number: int) -> None:
     assert log.table.values[:, 4].min() > 40.0
 
 
-def test_other_units_differ_in_every_respect() -> None:
+def test_other_units_differ_in_every_respect():
     units = [random_unit(np.random.default_rng(k)) for k in range(60)]
     assert {len(u.curve.slopes) for u in units} == {2, 3, 4, 5, 6}
     assert {len(u.regions) for u in units} == {1, 2, 3}
@@ -139,7 +134,7 @@ def test_other_units_differ_in_every_respect() -> None:
     assert any(np.any(np.diff(u.curve.slopes) > 0.0) for u in units)
 
 
-def test_a_curve_through_points_passes_through_them() -> None:
+def test_a_curve_through_points_passes_through_them():
     u, x = np.array([1.0, 4.0, 9.0]), np.array([2.0, 8.0, 9.0])
     curve = Curve.through(u, x)
     np.testing.assert_allclose(curve(u), x)
@@ -147,7 +142,7 @@ def test_a_curve_through_points_passes_through_them() -> None:
 
 
 @pytest.mark.parametrize('field', dataclasses.fields(Noise), ids=lambda field: field.name)
-def test_every_part_of_the_noise_is_used(field: dataclasses.Field) -> None:
+def test_every_part_of_the_noise_is_used(field):
     # A field nobody reads would make two units the same.
     noise = Noise(wander_mw=1.0, load_dependence=0.25)
     changed = dataclasses.replace(noise, **{field.name: 2.0 * getattr(noise, field.name)})

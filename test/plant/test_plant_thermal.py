@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thermal unit as a whole: its truth, its ranges, and what effects do to it alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 
@@ -13,7 +11,7 @@ from streams import needs_jit
 
 from valveflow_ros.plant.historian import Historian
 from valveflow_ros.plant.thermal_effects import thermal_catalogue
-from valveflow_ros.plant.thermal_plant import ThermalLog, simulate_thermal
+from valveflow_ros.plant.thermal_plant import simulate_thermal
 from valveflow_ros.plant.thermal_unit import (
     KINDS,
     GovernorValve,
@@ -34,7 +32,7 @@ QUIET = ThermalUnit(
 
 
 @functools.cache
-def quiet_log(*effects: str, days: float = 0.1, **changes: float) -> ThermalLog:
+def quiet_log(*effects, days=0.1, **changes):
     return simulate_thermal(days, 3, dataclasses.replace(QUIET, **changes), effects=effects)
 
 
@@ -43,7 +41,7 @@ def quiet_log(*effects: str, days: float = 0.1, **changes: float) -> ThermalLog:
 
 @pytest.mark.parametrize('number', [0, 1])
 @pytest.mark.parametrize('kind', KINDS)
-def test_the_static_power_is_of_the_form_it_says(kind: str, number: int) -> None:
+def test_the_static_power_is_of_the_form_it_says(kind, number):
     unit = random_unit(kind, number)
     opening, c, m = np.linspace(10.0, 80.0, 50), unit.no_load_mw, unit.exponent
     one = unit.static_power(opening, np.full(50, 14.0)) + c
@@ -55,7 +53,7 @@ def test_the_static_power_is_of_the_form_it_says(kind: str, number: int) -> None
     assert unit.static_power(np.array(0.0), 12.0) == -c
 
 
-def test_a_smooth_area_is_straight_between_its_knees_and_rounded_at_them() -> None:
+def test_a_smooth_area_is_straight_between_its_knees_and_rounded_at_them():
     area = SmoothArea((40.0, 70.0), (1.0, 0.5, 0.2), 2.0)
     slope = np.gradient(area(np.arange(0.0, 100.0, 0.01)), 0.01)
     expected = {20: 1.0, 55: 0.5, 90: 0.2, 40: 0.75, 39: 0.95, 41: 0.55}
@@ -63,7 +61,7 @@ def test_a_smooth_area_is_straight_between_its_knees_and_rounded_at_them() -> No
     assert area(np.array(0.0)) == 0.0
 
 
-def test_valves_in_sequence_overlap_and_add_up() -> None:
+def test_valves_in_sequence_overlap_and_add_up():
     group, demand = SequencedValves(), np.linspace(0.0, 100.0, 1001)
     np.testing.assert_allclose(group(demand), sum(v.area(demand) for v in group.valves))
     assert group(np.array(100.0)) == pytest.approx(sum(v.share for v in group.valves))
@@ -75,7 +73,7 @@ def test_valves_in_sequence_overlap_and_add_up() -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_units_of_a_kind_are_plausible_and_different(kind: str) -> None:
+def test_units_of_a_kind_are_plausible_and_different(kind):
     units = [random_unit(kind, number) for number in range(50)]
     assert len({unit.exponent for unit in units}) == 50
     assert unit_of(f'{kind}:number=7, vacuum_per_kpa=0') == dataclasses.replace(
@@ -94,9 +92,7 @@ def test_units_of_a_kind_are_plausible_and_different(kind: str) -> None:
 @needs_jit
 @pytest.mark.parametrize('number', [0, 11])
 @pytest.mark.parametrize('kind', KINDS)
-def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(
-    kind: str, number: int
-) -> None:
+def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(kind, number):
     log = simulate_thermal(1.0, number, random_unit(kind, number))
     true, error = log.truth, log.demand_mw - log.truth.power
     for column, low, high in (('plug', 5.0, 100.01), ('pressure', 7.0, 18.5), ('power', 125, 338)):
@@ -114,7 +110,7 @@ def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(
 
 
 @needs_jit
-def test_steady_rows_lie_on_the_static_power_to_within_noise() -> None:
+def test_steady_rows_lie_on_the_static_power_to_within_noise():
     unit = dataclasses.replace(random_unit('sequence', 2), vacuum_per_kpa=0.0)
     true = simulate_thermal(0.5, 8, unit).truth
     away = true.power - unit.static_power(true.plug, true.pressure)
@@ -124,14 +120,14 @@ def test_steady_rows_lie_on_the_static_power_to_within_noise() -> None:
     assert away[300:][still].std() < 1.5
 
 
-def test_steam_is_neither_made_nor_lost() -> None:
+def test_steam_is_neither_made_nor_lost():
     true, unit = quiet_log().truth, QUIET
     rise = np.diff(true.drum) * unit.storage_s / unit.pressure_rated_mpa
     np.testing.assert_allclose(rise, true.heat[1:] - true.flow[:-1], atol=1e-12)
 
 
 @needs_jit
-def test_the_condenser_moves_the_power_by_its_share_and_not_at_all_when_switched_off() -> None:
+def test_the_condenser_moves_the_power_by_its_share_and_not_at_all_when_switched_off():
     worse, none = quiet_log(days=1.0, vacuum_per_kpa=-0.01), quiet_log(days=1.0)
     shown = worse.extra['condenser_pressure_kpa']
     np.testing.assert_allclose(shown, worse.truth.condenser, atol=1e-6)
@@ -152,7 +148,7 @@ def test_the_condenser_moves_the_power_by_its_share_and_not_at_all_when_switched
 
 
 @pytest.mark.parametrize('recording', ['1s', 'minute', 'compressed'])
-def test_the_seed_decides_what_happens_and_the_record_changes_nothing(recording: str) -> None:
+def test_the_seed_decides_what_happens_and_the_record_changes_nothing(recording):
     unit, pair = random_unit('sequence', 1), ('backlash', 'opening_offset:b_percent=1')
     historian = Historian(recording, dropouts_per_day=50.0)
     plain, other = (simulate_thermal(0.02, 4, unit, effects=e) for e in (pair, pair[::-1]))
@@ -177,7 +173,7 @@ EARLY = {
 
 
 @pytest.mark.parametrize('name', thermal_catalogue())
-def test_an_effect_moves_nothing_outside_the_unit(name: str) -> None:
+def test_an_effect_moves_nothing_outside_the_unit(name):
     log, healthy = quiet_log(f'{name}:{EARLY.get(name, "")}'), quiet_log()
     for outside in ('demand_mw', 'temperature_degc', 'water_degc'):
         np.testing.assert_array_equal(getattr(log, outside), getattr(healthy, outside))
@@ -189,7 +185,7 @@ def test_an_effect_moves_nothing_outside_the_unit(name: str) -> None:
         np.testing.assert_array_equal(log.truth, healthy.truth)
 
 
-def test_slack_friction_stop_and_servo_act_on_their_side_of_the_sensor() -> None:
+def test_slack_friction_stop_and_servo_act_on_their_side_of_the_sensor():
     true = quiet_log('backlash:w_percent=1.2').truth
     assert np.abs(true.stem - true.plug).max() == pytest.approx(0.6, abs=1e-9)
     assert np.ptp(true.stem - true.plug) == pytest.approx(1.2, abs=1e-9)
@@ -203,7 +199,7 @@ def test_slack_friction_stop_and_servo_act_on_their_side_of_the_sensor() -> None
     assert np.abs(np.diff(true.plug)).max() <= 0.1 + 1e-9
 
 
-def test_wrong_sensors_show_what_they_say() -> None:
+def test_wrong_sensors_show_what_they_say():
     log = quiet_log('pressure_scale:g=0.02', 'opening_offset:b_percent=-1,drift_percent=10')
     pressure = log.table.column(Signal.MAIN_STEAM_PRESSURE)
     np.testing.assert_allclose(pressure, 1.02 * log.truth.pressure, rtol=1e-6)
@@ -217,9 +213,7 @@ def test_wrong_sensors_show_what_they_say() -> None:
 
 
 @pytest.mark.parametrize(('name', 'of_flow'), [('area_step', True), ('gain_step', False)])
-def test_area_and_efficiency_change_flow_or_power_at_their_moment(
-    name: str, of_flow: bool
-) -> None:
+def test_area_and_efficiency_change_flow_or_power_at_their_moment(name, of_flow):
     true = quiet_log(f'{name}:g=-0.03,t0_days=0.05').truth
     ratio = true.flow / QUIET.flow(true.plug, true.pressure)
     expected = np.repeat([1.0, 0.97 if of_flow else 1.0], 4320)
@@ -229,7 +223,7 @@ def test_area_and_efficiency_change_flow_or_power_at_their_moment(
     assert np.median((true.power - power)[5000:]) == pytest.approx(0.0, abs=0.3)
 
 
-def test_temperature_changes_the_power_per_kelvin() -> None:
+def test_temperature_changes_the_power_per_kelvin():
     own = quiet_log(temperature_per_k=-0.002)
     hidden = quiet_log(f'temperature:k=-0.002,reference_degc={QUIET.temperature_degc}')
     np.testing.assert_allclose(own.truth.power, hidden.truth.power, rtol=1e-12)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The slow truth of the thermal unit's loop: plain Python, one second after the other."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -13,14 +11,14 @@ from plants import naive_lag
 
 from valveflow_ros.plant.thermal_effects import ThermalHooks, thermal_effect
 from valveflow_ros.plant.thermal_loop import Series, TrueRows, law_of, run
-from valveflow_ros.plant.thermal_unit import TABLE_STEP_PERCENT, ThermalUnit, random_unit
+from valveflow_ros.plant.thermal_unit import TABLE_STEP_PERCENT, random_unit
 
 SECONDS = 3000
 FAULTS = ('backlash', 'stiction:before_sensor=1', 'rate_limit:r_percent_per_s=0.3',
           'saturation:max_percent=70', 'pressure_scale')  # fmt: skip
 
 
-def drives(unit: ThermalUnit, seed: int, faulty: bool) -> Series:
+def drives(unit, seed, faulty):
     """Return steps of the load and noise, with what effects do to the rows if asked for."""
     rng = np.random.default_rng(seed)
     n, one = SECONDS, np.ones(SECONDS)
@@ -35,25 +33,25 @@ def drives(unit: ThermalUnit, seed: int, faulty: bool) -> Series:
     )  # fmt: skip
 
 
-def naive_hold(y: float, x: float, time_s: float) -> float:
+def naive_hold(y, x, time_s):
     """Solve T y' + y = x exactly over one second in which x is held."""
     return x + (y - x) * math.exp(-1.0 / time_s)
 
 
-def naive_kpa(degc: float) -> float:
+def naive_kpa(degc):
     return 0.61094 * math.exp(17.625 * degc / (degc + 243.04))
 
 
 class NaiveMotion:
     """Servo speed, friction with rest and motion, stop, slack."""
 
-    def __init__(self, at: float, bank: object, fastest: float = math.inf) -> None:
+    def __init__(self, at, bank, fastest=math.inf):
         self.servo = self.stem = self.plug = at
         self.moving = 0
         self.bank = bank
         self.fastest = min(fastest, bank.rate_percent_per_s)
 
-    def __call__(self, wanted: float) -> float:
+    def __call__(self, wanted):
         bank, before = self.bank, self.servo
         self.servo += min(max(wanted - self.servo, -self.fastest), self.fastest)
         if np.sign(self.servo - before) != self.moving:
@@ -70,7 +68,7 @@ class NaiveMotion:
         return self.plug
 
 
-def naive(unit: ThermalUnit, hooks: ThermalHooks, s: Series) -> np.ndarray:
+def naive(unit, hooks, s):
     """Run the unit row by row; columns as `TrueRows`."""
     table = unit.area_table()
     known = np.arange(table.size) * TABLE_STEP_PERCENT
@@ -79,7 +77,7 @@ def naive(unit: ThermalUnit, hooks: ThermalHooks, s: Series) -> np.ndarray:
     rated, c, m = unit.pressure_rated_mpa, unit.no_load_mw, unit.exponent
     full = unit.rated_mw + c
 
-    def governor(flow: float, seen: float) -> float:
+    def governor(flow, seen):
         density = (seen / rated) ** m
         if unit.form == 'integrated_input':
             opening = float(np.interp(flow, grid, inverse.opening_of)) / density
@@ -87,7 +85,7 @@ def naive(unit: ThermalUnit, hooks: ThermalHooks, s: Series) -> np.ndarray:
             opening = float(np.interp(flow / density, grid, inverse.opening_of))
         return min(max(opening, 3.0), 100.0)
 
-    def steam(plug: float, p: float) -> float:
+    def steam(plug, p):
         density = (p / rated) ** m
         if unit.form == 'integrated_input':
             return float(np.interp(plug * density, known, table))
@@ -149,7 +147,7 @@ def naive(unit: ThermalUnit, hooks: ThermalHooks, s: Series) -> np.ndarray:
 
 @pytest.mark.parametrize('kind', ['choked', 'sequence_fixed', 'integrated_input'])
 @pytest.mark.parametrize('faulty', [False, True])
-def test_the_fast_loop_is_the_slow_one(kind: str, faulty: bool) -> None:
+def test_the_fast_loop_is_the_slow_one(kind, faulty):
     unit = random_unit(kind, 5)
     hooks = ThermalHooks.for_run(float(SECONDS))
     for text in FAULTS if faulty else ():
@@ -166,7 +164,7 @@ def test_the_fast_loop_is_the_slow_one(kind: str, faulty: bool) -> None:
 
 @pytest.mark.parametrize('kind', ['choked_fixed', 'sequence', 'integrated_input'])
 @pytest.mark.parametrize('load', [160.0, 300.0])
-def test_a_unit_left_alone_comes_to_rest_on_its_static_power(kind: str, load: float) -> None:
+def test_a_unit_left_alone_comes_to_rest_on_its_static_power(kind, load):
     unit = dataclasses.replace(random_unit(kind, 3), vacuum_per_kpa=0.0)
     n = 4 * 3600
     rest, one = np.zeros(n), np.ones(n)

@@ -2,15 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the ROS tests share: a context of their own and processes that are ended."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGTERM
-from typing import Any
 
 import pytest
 from ros_helpers import Processes
@@ -24,7 +20,7 @@ if importlib.util.find_spec('rclpy') is None and not os.environ.get('VALVEFLOW_R
 
 
 @pytest.fixture
-def context(ros_environment: dict[str, str]) -> Iterator[Any]:
+def context(ros_environment):
     """Give a ROS context in the test's own domain."""
     import rclpy
     from rclpy.context import Context
@@ -36,7 +32,7 @@ def context(ros_environment: dict[str, str]) -> Iterator[Any]:
 
 
 @pytest.fixture
-def listener(context: Any) -> Iterator[Any]:
+def listener(context):
     """Give a node that hears the monitor."""
     from listener import Listener
 
@@ -46,7 +42,7 @@ def listener(context: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def speaker(context: Any) -> Iterator[Any]:
+def speaker(context):
     """Give a node that says what a monitor says."""
     from test_ros_watch import Speaker
 
@@ -56,7 +52,7 @@ def speaker(context: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Processes]:
+def processes(ros_environment, tmp_path):
     """Give a way to start processes in the test's own domain."""
     made = Processes(ros_environment, tmp_path)
     yield made
@@ -64,7 +60,7 @@ def processes(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Proce
 
 
 @pytest.fixture
-def here(ros_environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def here(ros_environment, monkeypatch):
     """Let a test call the main function of a node in this process.
 
     Signals are put back, and so is what it chose in the environment for the middleware.
@@ -78,7 +74,7 @@ def here(ros_environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> It
 
 
 @pytest.fixture
-def jobs_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+def jobs_on_path(monkeypatch):
     """Let child processes import the module `hurt_jobs` beside this file."""
     before = os.environ.get('PYTHONPATH', '')
     monkeypatch.setenv('PYTHONPATH', f'{HERE}{os.pathsep}{before}')

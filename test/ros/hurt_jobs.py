@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jobs that go wrong in every way a fit or a diagnosis might."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
 import signal
 import time
 from dataclasses import replace
-from typing import Any
 
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.events import DiagnosisContent
@@ -18,46 +15,46 @@ from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node.engine import example_curve
 
 
-def good(task: Any) -> Any:
+def good(task):
     """Return a curve at once."""
     curve = example_curve(Settings())
     source = replace(curve.source, window_end_ns=int(task.contents.time_ns[-1]))
     return replace(curve, source=source).with_id()
 
 
-def raises(task: Any) -> Any:
+def raises(task):
     """Fail as code with a fault does."""
     raise ZeroDivisionError('a fault')
 
 
-def refuses(task: Any) -> Any:
+def refuses(task):
     """Refuse the data as `fit` does."""
     raise DataError('There is no curve in these data.')
 
 
-def greedy(task: Any) -> Any:
+def greedy(task):
     """Ask for more memory than there is."""
     raise MemoryError
 
 
-def hangs(task: Any) -> Any:
+def hangs(task):
     """Never come back."""
     time.sleep(3600.0)
 
 
-def dies(task: Any) -> Any:
+def dies(task):
     """Be killed, as by the kernel when memory runs out."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def prints(task: Any) -> Any:
+def prints(task):
     """Write to standard output, where the results go, before giving a good one."""
     print('x' * 10_000, flush=True)
     os.write(1, b'y' * 10_000)
     return good(task)
 
 
-def writes_nonsense(task: Any) -> Any:
+def writes_nonsense(task):
     """Write what is no message into every socket there is; eight bytes are the task's name."""
     sent = (task.request_ns << 1).to_bytes(8, 'big') + b'no message at all'
     for name in os.listdir('/proc/self/fd'):
@@ -67,28 +64,28 @@ def writes_nonsense(task: Any) -> Any:
     time.sleep(3600.0)
 
 
-def nothing(task: Any) -> Any:
+def nothing(task):
     """Give no result at all."""
 
 
-def nan(task: Any) -> Any:
+def nan(task):
     first, second = good(task).pieces
     return replace(good(task), pieces=(replace(first, slope=float('nan')), second))
 
 
-def backwards(task: Any) -> Any:
+def backwards(task):
     return replace(good(task), pieces=good(task).pieces[::-1])
 
 
-def of_other_data(task: Any) -> Any:
+def of_other_data(task):
     return replace(good(task), source=example_curve(Settings()).source).with_id()
 
 
-def renamed(task: Any) -> Any:
+def renamed(task):
     return replace(good(task), model_id='000000000000')
 
 
-def told(task: Any) -> Any:
+def told(task):
     """Do the one of `BAD_FITS` whose number is the task's name, or `prints`."""
     return [*BAD_FITS, prints][task.request_ns](task)
 
@@ -105,7 +102,7 @@ BAD_FITS = {
 }
 
 
-def diagnosed(task: Any) -> Any:
+def diagnosed(task):
     """Return a small diagnosis at once."""
     content = {
         'verdict': 'nothing', 'sentence': 'The model explains the unit.', 'causes': [],
@@ -115,16 +112,16 @@ def diagnosed(task: Any) -> Any:
     return DiagnosisContent(task.window_end_ns, json.dumps(content))
 
 
-def no_verdict(task: Any) -> Any:
+def no_verdict(task):
     content = diagnosed(task)
     return replace(content, text=content.text.replace('nothing', 'perhaps'))
 
 
-def diagnosed_other_data(task: Any) -> Any:
+def diagnosed_other_data(task):
     return replace(diagnosed(task), window_end_ns=1)
 
 
-def half(task: Any) -> Any:
+def half(task):
     return replace(diagnosed(task), text='{"verdict": "named", "sentence": "Something."}')
 
 

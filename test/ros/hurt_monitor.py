@@ -6,15 +6,11 @@ A file `hold` in the working folder names the place; `held` is written when it i
 it goes on when `hold` is gone.
 """
 
-from __future__ import annotations
-
 import ctypes
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from valveflow_ros.logs.part_file import PartFile
 from valveflow_ros.ros import monitor_main
@@ -26,7 +22,7 @@ HOLD, HELD = Path('hold'), Path('held')
 LOCKED_S = 3
 
 
-def wanted(place: str) -> bool:
+def wanted(place):
     # The file may go at any moment, also between a look for it and a look into it.
     try:
         return HOLD.read_text() == place
@@ -34,7 +30,7 @@ def wanted(place: str) -> bool:
         return False
 
 
-def hold_up(place: str) -> None:
+def hold_up(place):
     if not wanted(place):
         return
     HELD.write_text(place)
@@ -42,15 +38,15 @@ def hold_up(place: str) -> None:
         time.sleep(0.01)
 
 
-def held_at(place: str, work: Callable[..., Any]) -> Callable[..., Any]:
-    def run(*args: Any, **more: Any) -> Any:
+def held_at(place, work):
+    def run(*args, **more):
         hold_up(place)
         return work(*args, **more)
 
     return run
 
 
-def keep_the_lock() -> None:
+def keep_the_lock():
     """Take the interpreter for a while and let nobody else run, as bad compiled code does."""
     while not wanted('interpreter'):
         time.sleep(0.01)
@@ -59,8 +55,8 @@ def keep_the_lock() -> None:
 
 
 if __name__ == '__main__':
-    MonitorNode.step = held_at('loop', MonitorNode.step)  # type: ignore[method-assign]
-    PolledSubscription.take = held_at('poll', PolledSubscription.take)  # type: ignore[method-assign]
-    PartFile.write = held_at('writer', PartFile.write)  # type: ignore[method-assign]
+    MonitorNode.step = held_at('loop', MonitorNode.step)
+    PolledSubscription.take = held_at('poll', PolledSubscription.take)
+    PartFile.write = held_at('writer', PartFile.write)
     threading.Thread(target=keep_the_lock, daemon=True).start()
     sys.exit(monitor_main.main(sys.argv[1:]))

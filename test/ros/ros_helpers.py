@@ -2,16 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Waiting for events, processes that are ended, and the sockets they hold."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
-import psutil
 import pytest
 
 # The limit for waiting on an event: the first run compiles, and the machine may be busy.
@@ -19,7 +13,7 @@ PATIENCE_S = 240.0
 LOOPBACK = '127.0.0.1'
 
 
-def wait_until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
+def wait_until(condition, what, patience_s=PATIENCE_S):
     """Return what a condition gives once it is true; fail after a generous while."""
     end_s = time.monotonic() + patience_s
     while not (found := condition()):
@@ -32,12 +26,12 @@ def wait_until(condition: Callable[[], Any], what: str, patience_s: float = PATI
 class Processes:
     """Starts modules of ours as processes and ends those that are left."""
 
-    def __init__(self, environment: dict[str, str], folder: Path) -> None:
+    def __init__(self, environment, folder):
         self._environment = environment
         self._folder = folder
-        self._all: list[subprocess.Popen[bytes]] = []
+        self._all = []
 
-    def start(self, module: str, *arguments: str, **more: str) -> subprocess.Popen[bytes]:
+    def start(self, module, *arguments, **more):
         """Start ``python -m module``; its output goes to files."""
         stem = f'{module.rsplit(".", 1)[-1]}_{len(self._all)}'
         with (self._folder / f'{stem}.log').open('wb') as out:
@@ -51,13 +45,13 @@ class Processes:
         self._all.append(process)
         return process
 
-    def output(self, process: subprocess.Popen[bytes]) -> str:
+    def output(self, process):
         """Return what a process has said so far."""
         number = self._all.index(process)
         (path,) = self._folder.glob(f'*_{number}.log')
         return path.read_text(errors='replace')
 
-    def end_all(self) -> None:
+    def end_all(self):
         """Kill what still runs."""
         for process in self._all:
             if process.poll() is None:
@@ -65,11 +59,11 @@ class Processes:
                 process.wait()
 
 
-def bound(process: psutil.Process) -> list[tuple[str, int]]:
+def bound(process):
     """Return address and port of each internet socket of a process."""
     return [tuple(found.laddr) for found in process.net_connections('inet') if found.laddr]
 
 
-def rtps_ports(domain: int) -> range:
+def rtps_ports(domain):
     """Return the ports that DDS gives to a domain (OMG DDSI-RTPS 9.6.1)."""
     return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))

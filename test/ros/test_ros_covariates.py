@@ -2,19 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A covariate in the running node: from its topic into diagnosis, recording, state and health."""
 
-from __future__ import annotations
-
 import itertools
 import time
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from listener import Listener, ended, start_monitor
+from listener import ended, start_monitor
 from rclpy.parameter import Parameter
-from ros_helpers import Processes
 from valveflow_msgs.msg import Diagnosis
 
 import valveflow_ros as vf
@@ -42,11 +36,11 @@ MINUTES = {
 }  # fmt: skip
 
 
-def times_of(frame: Any) -> list[int]:
+def times_of(frame):
     return frame['time'].dt.tz_convert(None).to_numpy('datetime64[ns]').astype(np.int64).tolist()
 
 
-def steps(frame: Any) -> Iterator[Step]:
+def steps(frame):
     """Yield the rows of a plant; every tenth value of the covariate is NaN."""
     for k, time_ns in enumerate(times_of(frame)):
         value = np.nan if k % 10 == 0 else frame[COLUMN].iloc[k]
@@ -55,9 +49,7 @@ def steps(frame: Any) -> Iterator[Step]:
 
 
 @pytest.mark.slow
-def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
-    processes: Processes, listener: Listener, tmp_path: Path
-) -> None:
+def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(processes, listener, tmp_path):
     plant = vf.simulate(days=2.5, seed=3, unit='choked:number=3', recording='minute')
     frame = plant.to_dataframe()
     monitor = start_monitor(processes, tmp_path / 'recordings', **MINUTES)
@@ -65,7 +57,7 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
     player = Player(listener.node, names, 0.0, True, lambda: False)
     played = steps(frame)
 
-    def taken() -> int:
+    def taken():
         return int(listener.value('fit', 'Samples taken in all runs') or 0)
 
     assert player.wait_for_listeners(240.0) == []
@@ -106,7 +98,7 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
     told = '/weather/temperature is not sent; it is optional.'
     assert (ambient.level, ambient.message) == (b'\x00', told)
 
-    def silent() -> bool:
+    def silent():
         status = listener.status('input covariate vacuum')
         told = status.message.startswith(f'{TOPIC} has been silent for')
         return told and status.message.endswith(' s; it is optional.') and status.level == b'\x00'
@@ -138,9 +130,7 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(
         ('a=/u2/generated_power', "entry '/u2/generated_power' is the topic of another input."),
     ],
 )
-def test_a_bad_entry_is_refused_in_the_words_of_the_option(
-    context: Any, text: str, sentence: str
-) -> None:
+def test_a_bad_entry_is_refused_in_the_words_of_the_option(context, text, sentence):
     wanted = Parameter('covariates', value=text)
     with pytest.raises(ParameterError) as refused:
         MonitorNode(context=context, parameter_overrides=[wanted])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo tells one story: each thing when it first happens, and at the end what it meant."""
 
-from __future__ import annotations
-
 import pytest
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic
 
@@ -16,21 +14,21 @@ FAULT = T0 + 36 * HOUR
 KNEES = [1250.0, 1600.0, 1900.0]
 
 
-def curve(at_ns: int, knees: list[float]) -> FlowCharacteristic:
+def curve(at_ns, knees):
     return FlowCharacteristic(
         status=FlowCharacteristic.FRESH, model_id=str(at_ns), window_end=to_time(at_ns),
         breakpoints=[900.0, *knees, 2500.0], pieces=len(knees) + 1,
     )  # fmt: skip
 
 
-def alarm(at_ns: int, occurrence: int, state: int = Alarm.UNACKNOWLEDGED) -> Alarm:
+def alarm(at_ns, occurrence, state=Alarm.UNACKNOWLEDGED):
     return Alarm(
         header=header(at_ns, 'u'), name='residual', state=state, occurrence=occurrence,
         sentence='The unit gives 4.4 MW less.',
     )  # fmt: skip
 
 
-def diagnosis(at_ns: int, *names: str, sentence: str = '') -> Diagnosis:
+def diagnosis(at_ns, *names, sentence=''):
     return Diagnosis(
         header=header(at_ns, 'u'), model_id='m', sentence=sentence,
         verdict=Diagnosis.NAMED if names else Diagnosis.NOTHING,
@@ -38,11 +36,11 @@ def diagnosis(at_ns: int, *names: str, sentence: str = '') -> Diagnosis:
     )  # fmt: skip
 
 
-def lines(capsys: pytest.CaptureFixture[str]) -> list[str]:
+def lines(capsys):
     return capsys.readouterr().out.splitlines()
 
 
-def test_one_fault_is_one_story(capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_fault_is_one_story(capsys):
     story = Story(FAULT)
     for k in range(1, 9):
         story.on_curve(curve(T0 + 4 * k * HOUR, [u + k for u in KNEES]))
@@ -69,7 +67,7 @@ def test_one_fault_is_one_story(capsys: pytest.CaptureFixture[str]) -> None:
     assert 'the first alarm came 1.0 h later; alarms in all: 5' in story.outcome()
 
 
-def test_a_diagnosis_is_told_in_full_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_diagnosis_is_told_in_full_once(capsys):
     story = Story(FAULT)
     story.on_diagnosis(Diagnosis())
     story.on_diagnosis(diagnosis(FAULT - HOUR))
@@ -85,7 +83,7 @@ def test_a_diagnosis_is_told_in_full_once(capsys: pytest.CaptureFixture[str]) ->
     ]
 
 
-def test_the_times_of_the_lines_never_go_back(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_times_of_the_lines_never_go_back(capsys):
     story = Story(FAULT)
     story.on_alarm(alarm(FAULT + 5 * HOUR, 1))
     story.on_diagnosis(diagnosis(FAULT + 3 * HOUR))
@@ -94,7 +92,7 @@ def test_the_times_of_the_lines_never_go_back(capsys: pytest.CaptureFixture[str]
     assert late.endswith(f'(at {moment(FAULT + 3 * HOUR)})')
 
 
-def test_what_is_nothing_to_tell_is_told_once_or_not(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_nothing_to_tell_is_told_once_or_not(capsys):
     story = Story(FAULT)
     for _ in range(2):
         story.on_curve(FlowCharacteristic(status=FlowCharacteristic.UNKNOWN, cause='No rows.'))
@@ -117,5 +115,5 @@ def test_what_is_nothing_to_tell_is_told_once_or_not(capsys: pytest.CaptureFixtu
         (['a', 'b'], 0.5, 'Not all came out: a; b. 3 days (--days) are enough for that.'),
     ],
 )
-def test_the_last_line_tells_what_is_missing(missing: list[str], days: float, words: str) -> None:
+def test_the_last_line_tells_what_is_missing(missing, days, words):
     assert told_in_the_end(missing, days) == words

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process is known in the domain before it begins to work, and can be stopped until then."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os
@@ -11,15 +9,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip('rclpy')
 import rclpy
-from rclpy.context import Context
 from rclpy.node import Node
 from ros_helpers import wait_until
 
@@ -59,7 +54,7 @@ rclpy.shutdown()
 """
 
 
-def joined(count: int, *neighbours: str) -> Any:
+def joined(count, *neighbours):
     """Return the names it came to know, whether ROS was still up, and what it holds."""
     done = subprocess.run(
         [sys.executable, '-c', JOIN, str(count), '20' if neighbours else '0', *neighbours],
@@ -71,9 +66,7 @@ def joined(count: int, *neighbours: str) -> Any:
 
 
 @pytest.mark.parametrize('count', [0, 5])
-def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(
-    context: Context, count: int
-) -> None:
+def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(context, count):
     neighbour = Node('neighbour', context=context)
     try:
         names, up, after, plain = joined(count, 'neighbour')
@@ -91,26 +84,26 @@ def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(
 class Told:
     """A node that is said to have heard of some others."""
 
-    def __init__(self, context: Context, names: list[str]) -> None:
+    def __init__(self, context, names):
         self.context, self.names, self.there = context, names, True
 
-    def get_node_names(self) -> list[str]:
+    def get_node_names(self):
         if 'broken' in self.names:
             raise RuntimeError('no graph')
         return self.names
 
-    def destroy_node(self) -> None:
+    def destroy_node(self):
         self.there = False
 
 
 class Graph:
     """Makes nodes that are said to have heard of others; None where one cannot be made."""
 
-    def __init__(self) -> None:
-        self.nodes: list[Told] = []
-        self.heard: list[list[str] | None] = [[]] * 5
+    def __init__(self):
+        self.nodes = []
+        self.heard = [[]] * 5
 
-    def create(self, name: str, context: Context, **more: Any) -> Told:
+    def create(self, name, context, **more):
         heard = self.heard[len(self.nodes)]
         if heard is None:
             raise RuntimeError('no more nodes')
@@ -119,9 +112,7 @@ class Graph:
 
 
 @pytest.fixture
-def graph(
-    monkeypatch: pytest.MonkeyPatch, ros_environment: dict[str, str], here: None
-) -> Iterator[Graph]:
+def graph(monkeypatch, ros_environment, here):
     made = Graph()
     monkeypatch.setattr(rclpy, 'create_node', made.create)
     yield made
@@ -140,9 +131,7 @@ def graph(
         ([['broken'], ['broken']], 0),
     ],
 )
-def test_it_goes_on_as_the_one_that_heard_of_most(
-    graph: Graph, heard: list[list[str] | None], best: int
-) -> None:
+def test_it_goes_on_as_the_one_that_heard_of_most(graph, heard, best):
     graph.heard = heard
     made = graph.nodes
     presence = Presence([], count=len(heard))
@@ -159,7 +148,7 @@ def test_it_goes_on_as_the_one_that_heard_of_most(
 
 
 @pytest.mark.parametrize('failing', [1, 2])
-def test_where_one_more_cannot_be_made_those_before_will_do(graph: Graph, failing: int) -> None:
+def test_where_one_more_cannot_be_made_those_before_will_do(graph, failing):
     graph.heard[failing - 1] = None
     presence = Presence([], count=5)
     assert len(graph.nodes) == failing - 1
@@ -177,12 +166,8 @@ def test_where_one_more_cannot_be_made_those_before_will_do(graph: Graph, failin
     ],
 )
 def test_it_shows_itself_only_where_that_helps_and_is_allowed(
-    graph: Graph,
-    monkeypatch: pytest.MonkeyPatch,
-    middleware: str,
-    environ: dict[str, str],
-    shown: int,
-) -> None:
+    graph, monkeypatch, middleware, environ, shown
+):
     name = 'valveflow_ros.ros.domain.get_rmw_implementation_identifier'
     monkeypatch.setattr(name, lambda: middleware)
     presence = Presence([], environ=environ)
@@ -192,12 +177,10 @@ def test_it_shows_itself_only_where_that_helps_and_is_allowed(
 
 
 @pytest.mark.usefixtures('ros_environment', 'here')
-def test_a_signal_while_the_monitor_loads_ends_it_at_once(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_signal_while_the_monitor_loads_ends_it_at_once(monkeypatch, capfd):
     reached = []
 
-    def load(name: str) -> Any:
+    def load(name):
         os.kill(os.getpid(), signal.SIGTERM)
         reached.append(name)
         time.sleep(60.0)
@@ -212,10 +195,10 @@ def test_a_signal_while_the_monitor_loads_ends_it_at_once(
 
 
 @pytest.mark.usefixtures('here')
-def test_signals_cut_only_where_they_may_and_only_once() -> None:
+def test_signals_cut_only_where_they_may_and_only_once():
     stop = StopFlag().install()
 
-    def work() -> None:
+    def work():
         with stop.cutting():
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(60.0)
@@ -259,7 +242,7 @@ rclpy.shutdown()
 """
 
 
-def chosen(**given: str) -> dict[str, str]:
+def chosen(**given):
     environ = dict(given)
     choose_transport(environ, FAST_DDS)
     return environ
@@ -274,25 +257,25 @@ def chosen(**given: str) -> dict[str, str]:
         *((f'ROS_{name}', '1') for name in ('LOCALHOST_ONLY', 'STATIC_PEERS', 'DISCOVERY_SERVER')),
     ],
 )
-def test_who_has_chosen_keeps_the_choice(name: str, value: str, reach: str) -> None:
+def test_who_has_chosen_keeps_the_choice(name, value, reach):
     given = {name: value, RANGE: reach}
     kept = value == 'SHM' or reach == 'LOCALHOST'
     assert chosen(**given) == (given if kept else {**given, TRANSPORTS: SOCKETS})
 
 
 @pytest.mark.parametrize('reach', ['LOCALHOST', 'SUBNET', ''])
-def test_another_middleware_is_left_alone(reach: str) -> None:
+def test_another_middleware_is_left_alone(reach):
     environ = {RANGE: reach}
     choose_transport(environ, 'rmw_cyclonedds_cpp')
     assert environ == {RANGE: reach}
 
 
 @pytest.mark.parametrize('reach', ['', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'])
-def test_the_reach_stays_as_it_was(reach: str) -> None:
+def test_the_reach_stays_as_it_was(reach):
     assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: SOCKETS}
 
 
-def test_on_one_host_the_profile_takes_the_place_of_the_limit() -> None:
+def test_on_one_host_the_profile_takes_the_place_of_the_limit():
     environ = chosen(**{RANGE: 'LOCALHOST'})
     assert environ.pop(RANGE) == 'SYSTEM_DEFAULT'
     assert set(environ) == set(PROFILES)
@@ -304,9 +287,7 @@ def test_on_one_host_the_profile_takes_the_place_of_the_limit() -> None:
     ('transports', 'shared', 'reach'),
     [('', False, 'LOCALHOST'), ('', False, 'SUBNET'), ('DEFAULT', True, 'SUBNET')],
 )
-def test_a_node_maps_no_shared_memory_unless_that_is_asked_for(
-    transports: str, shared: bool, reach: str
-) -> None:
+def test_a_node_maps_no_shared_memory_unless_that_is_asked_for(transports, shared, reach):
     environ = {k: v for k, v in os.environ.items() if k not in PROFILES}
     environ |= {TRANSPORTS: transports, RANGE: reach}
     done = subprocess.run(

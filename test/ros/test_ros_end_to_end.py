@@ -2,32 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plant and a monitor as two processes, a listener over DDS, and what is on disk afterwards."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-from listener import MONITOR, Listener, ended, start_monitor, start_plant
+from listener import MONITOR, ended, start_monitor, start_plant
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from ros_helpers import LOOPBACK, Processes, bound, rtps_ports
+from ros_helpers import LOOPBACK, bound, rtps_ports
 from std_msgs.msg import Float64MultiArray
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic, JournalEntry, Prediction
 
-from valveflow_ros.logs import LogContents, RecordingWriter, open_log
+from valveflow_ros.logs import RecordingWriter, open_log
 from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import MIXED
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.records import SIGNALS, Signal
 from valveflow_ros.ros.decoding import from_time
 from valveflow_ros.ros.encoding import float64_bytes
 from valveflow_ros.ros.node.state_store import LOCK
@@ -45,9 +41,7 @@ FAULT_NS = DEFAULT_START_NS + round(FAULT_DAYS * 86400e9)
 SENT = [Signal.VALVE_COMMAND, *(info.signal for info in SIGNALS if info.required)]
 
 
-def test_a_run_from_the_plant_to_the_disk(
-    processes: Processes, listener: Listener, ros_environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_run_from_the_plant_to_the_disk(processes, listener, ros_environment, tmp_path):
     records = tmp_path / 'home' / 'deep' / 'recordings'
     ros_environment['ROS_LOG_DIR'] = str(tmp_path / 'home' / 'logs')
     before = os.umask(0)
@@ -87,7 +81,7 @@ def test_a_run_from_the_plant_to_the_disk(
     a_changed_recording_is_noticed(log, tmp_path / 'changed')
 
 
-def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None:
+def live_parameter_and_acknowledgement(listener, monitor):
     """Change a live parameter early, then wait for the alarm of the fault and acknowledge it."""
     listener.until(lambda: listener.value('fit', TAKEN) not in ('', '0'), 'samples')
     wanted = Parameter('alarm_on_delay', value=90).to_parameter_msg()
@@ -96,7 +90,7 @@ def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None
     )
     assert answer.results[0].successful, answer.results[0].reason
 
-    def raised() -> bool:
+    def raised():
         assert monitor.poll() is None
         standing = (a for a in listener.alarms if a.state == Alarm.UNACKNOWLEDGED)
         return any(from_time(a.header.stamp) >= FAULT_NS for a in standing)
@@ -123,7 +117,7 @@ def live_parameter_and_acknowledgement(listener: Listener, monitor: Any) -> None
     assert listener.value('diagnosis', 'Running') == 'no'
 
 
-def nobody_else_is_listened_to(monitor: Any, domain: int) -> None:
+def nobody_else_is_listened_to(monitor, domain):
     process = psutil.Process(monitor.pid)
     family = (process, *process.children(recursive=True))
     found = [place for each in family for place in bound(each)]
@@ -131,7 +125,7 @@ def nobody_else_is_listened_to(monitor: Any, domain: int) -> None:
     assert {address for address, _ in found} == {LOOPBACK}
 
 
-def nobody_else_may_read(home: Path) -> None:
+def nobody_else_may_read(home):
     modes = {path: stat.S_IMODE(path.lstat().st_mode) for path in home.rglob('*')}
     files = {path for path in modes if path.is_file()}
     assert {'metadata.yaml', LOCK} <= {path.name for path in files}
@@ -140,7 +134,7 @@ def nobody_else_may_read(home: Path) -> None:
     assert {mode for path, mode in modes.items() if path not in files} == {0o700}
 
 
-def nothing_lost(listener: Listener, rows: int) -> None:
+def nothing_lost(listener, rows):
     for signal in SENT:
         item = f'input {SIGNALS[signal].topic}'
         assert listener.value(item, 'Messages lost on the way') == '0'
@@ -149,7 +143,7 @@ def nothing_lost(listener: Listener, rows: int) -> None:
     assert listener.value('recorder', 'Messages dropped') == '0'
 
 
-def the_latched_curve(listener: Listener) -> None:
+def the_latched_curve(listener):
     """The curve that one who comes late gets is the last one, and near the truth."""
     curve = listener.late(FlowCharacteristic, 'characteristic')
     assert repr(curve) == repr(listener.curves[-1])
@@ -167,7 +161,7 @@ def the_latched_curve(listener: Listener) -> None:
     assert np.sqrt(np.mean(off**2)) < 5.0
 
 
-def recorded_is_sent(log: LogContents, table: SampleTable) -> None:
+def recorded_is_sent(log, table):
     """Every value with its time stands in the recording, in the order sent."""
     for signal in SENT:
         messages = list(log.iter_messages([f'/{SIGNALS[signal].topic}']))
@@ -178,10 +172,10 @@ def recorded_is_sent(log: LogContents, table: SampleTable) -> None:
     assert log_ns == sorted(set(log_ns))
 
 
-def recorded_is_said(log: LogContents, listener: Listener, table: SampleTable) -> None:
+def recorded_is_said(log, listener, table):
     """What was heard over DDS is what stands on disk."""
 
-    def said(kind: Any, name: str) -> list[Any]:
+    def said(kind, name):
         found = log.iter_messages([f'{MONITOR}/{name}'])
         return [deserialize_message(message.data, kind) for message in found]
 
@@ -197,7 +191,7 @@ def recorded_is_said(log: LogContents, listener: Listener, table: SampleTable) -
     np.testing.assert_array_equal([m.measured_mw for m in predictions], power)
 
 
-def the_files_own_words(log: LogContents) -> None:
+def the_files_own_words(log):
     settings = Settings(json.loads(log.attachments['parameters.json']))
     assert settings.text('unit_tag') == 'unit 1'
     topics = json.loads(log.attachments['topics.json'])
@@ -207,13 +201,13 @@ def the_files_own_words(log: LogContents) -> None:
         assert info.type_hash.startswith('RIHS01_')
 
 
-def others_read_it(folder: Path, table: SampleTable) -> None:
+def others_read_it(folder, table):
     """A reader that is not ours finds the same values."""
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     with AnyReader([folder], default_typestore=store) as reader:
         by_topic = {connection.topic: connection for connection in reader.connections}
 
-        def read(topic: str) -> list[Any]:
+        def read(topic):
             connection = by_topic[topic]
             found = reader.messages([connection])
             return [reader.deserialize(raw, connection.msgtype) for _, _, raw in found]
@@ -228,7 +222,7 @@ def others_read_it(folder: Path, table: SampleTable) -> None:
         assert by_topic['/diagnostics'].msgcount > 0
 
 
-def a_changed_recording_is_noticed(log: LogContents, folder: Path) -> None:
+def a_changed_recording_is_noticed(log, folder):
     """One bit of one prediction, or one value of one input, and the comparison says where."""
     names = {'shift_mw': f'{MONITOR}/prediction', 'measured_mw': '/generated_power'}
     for field, name in names.items():

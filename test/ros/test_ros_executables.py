@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every executable: its help, its example as it stands there, and each refusal in a sentence."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json
@@ -13,15 +11,13 @@ import shlex
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from opcua_server import mapping, write_mapping
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
-from ros_helpers import Processes, wait_until
+from ros_helpers import wait_until
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import PlantSample
 
@@ -45,11 +41,11 @@ WORKS = {
 }  # fmt: skip
 
 
-def there(name: str) -> bool:
+def there(name):
     return name not in NEEDS or importlib.util.find_spec(NEEDS[name]) is not None
 
 
-def result_of(main: Callable[[Sequence[str]], int], words: Sequence[str]) -> Any:
+def result_of(main, words):
     """Return the exit status of a main function in this process."""
     try:
         return main(words)
@@ -57,14 +53,12 @@ def result_of(main: Callable[[Sequence[str]], int], words: Sequence[str]) -> Any
         return error.code
 
 
-def named(name: str) -> Callable[[Sequence[str]], int]:
+def named(name):
     return importlib.import_module(f'valveflow_ros.ros.{MAINS[name]}').main
 
 
 @pytest.mark.usefixtures('here')
-def test_help_is_a_page_and_its_example_works(
-    context: Any, processes: Processes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_is_a_page_and_its_example_works(context, processes, tmp_path, capsys):
     # A player begins once somebody listens to every input.
     ears = Node('ears', context=context)
     for topic, kind in (*((s.topic, Float64) for s in SIGNALS), ('plant_sample', PlantSample)):
@@ -86,7 +80,7 @@ def test_help_is_a_page_and_its_example_works(
         running[name] = processes.start(module, *shlex.split(found[1]))
     for name, process in running.items():
 
-        def works(name: str = name, process: Any = process) -> bool:
+        def works(name=name, process=process):
             said = processes.output(process)
             found = re.search(WORKS[name], said) is not None
             assert found or process.poll() is None, said
@@ -102,7 +96,7 @@ def test_help_is_a_page_and_its_example_works(
 
 
 @pytest.mark.parametrize('module', ['monitor_main', 'watch_main'])
-def test_help_that_nobody_reads_to_its_end_is_no_accident(module: str) -> None:
+def test_help_that_nobody_reads_to_its_end_is_no_accident(module):
     """As by ``monitor --help | head -1``: the pipe is closed before a letter is written."""
     reader, writer = os.pipe()
     os.close(reader)
@@ -124,9 +118,7 @@ def test_help_that_nobody_reads_to_its_end_is_no_accident(module: str) -> None:
         (demo.parser, '--output d --seed x', "'x' is no whole number"),
     ],
 )
-def test_what_is_no_number_is_refused_in_words(
-    parser: Any, words: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_number_is_refused_in_words(parser, words, said, capsys):
     with pytest.raises(SystemExit) as ended:
         parser().parse_args(words.split())
     assert ended.value.code == 2
@@ -171,14 +163,8 @@ PARAMETERS = {
 @pytest.mark.usefixtures('ros_environment', 'here')
 @pytest.mark.parametrize(('name', 'words', 'said', 'status'), REFUSED)
 def test_what_cannot_be_done_is_said_in_a_sentence(
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    name: str,
-    words: str,
-    said: str,
-    status: int,
-) -> None:
+    capfd, monkeypatch, tmp_path, name, words, said, status
+):
     if not there(name):
         pytest.skip(f'{NEEDS[name]} is not installed')
     monkeypatch.chdir(tmp_path)

@@ -2,19 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What /diagnostics says of inputs, curve, reference and alarms."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from valveflow_ros.curve.characteristic import Characteristic, Support
+from valveflow_ros.curve.characteristic import Support
 from valveflow_ros.curve.shift import judge_shift
 from valveflow_ros.fit.result import NOT_REFINED
 from valveflow_ros.monitoring.alarm_state import AlarmAction
@@ -53,7 +50,7 @@ STRING = Publishers(0, ('std_msgs/msg/String',))
 class Scene:
     """An input's circumstances, healthy unless changed; or only a stamped sample is sent."""
 
-    def __init__(self, stamped: bool = False, **settings: object) -> None:
+    def __init__(self, stamped=False, **settings):
         self.health = InputHealth(Settings(settings), TOPICS)
         self.counts = {info.topic: dict.fromkeys(REASONS, 0) for info in SIGNALS}
         self.silence()
@@ -62,39 +59,39 @@ class Scene:
         for name in names:
             self.hear(name)
 
-    def silence(self) -> None:
+    def silence(self):
         self.statistics = {name: TopicStatistics() for name in TOPICS}
-        self.publishers: dict[str, Publishers] = {}
+        self.publishers = {}
 
-    def hear(self, name: str, at: float = NOW) -> None:
+    def hear(self, name, at=NOW):
         found = self.statistics[name]
         for k in range(5, -1, -1):
             found.note_arrival(1, at - k)
             found.note_number(found.received + 1)
 
-    def note(self, name: str, signal: int, value: float, time_ns: int = 1) -> None:
+    def note(self, name, signal, value, time_ns=1):
         self.health.note(name, [(time_ns, signal, value, 0)])
 
-    def stamp(self, off_s: float) -> None:
+    def stamp(self, off_s):
         """Receive an opening whose stamp is that far from this machine's clock."""
         self.note(OPENING, Signal.VALVE_OPENING, 50.0, time.time_ns() + round(off_s * NS_PER_S))
 
-    def item(self, topic: str = OPENING, listening: float = 100.0, at: float = NOW + 0.5,
-             newest_ns: int = 0) -> Item:  # fmt: skip
+    def item(self, topic=OPENING, listening=100.0, at=NOW + 0.5,
+             newest_ns=0):  # fmt: skip
         items = self.health.items(
             self.statistics, self.counts, self.publishers, at, listening, newest_ns
         )
         (found,) = [item for item in items if item.name == f'input {topic}']
         return found
 
-    def says(self, level: Level, words: str, topic: str = OPENING, **more: Any) -> None:
+    def says(self, level, words, topic=OPENING, **more):
         item = self.item(topic, **more)
         assert words in item.sentence, item.sentence
         assert item.level == level
         assert item.sentence.endswith(('.', '?'))
 
 
-def test_a_healthy_input_says_its_rate_once_it_is_known() -> None:
+def test_a_healthy_input_says_its_rate_once_it_is_known():
     scene = Scene()
     scene.says(Level.OK, '1 Hz.')
     values = scene.item().values
@@ -123,8 +120,8 @@ def test_a_healthy_input_says_its_rate_once_it_is_known() -> None:
     ],
 )
 def test_stamps_off_this_machines_clock_are_told_once_and_only_without_a_clock(
-    off_s: float, level: Level, words: str
-) -> None:
+    off_s, level, words
+):
     scene = Scene()
     scene.stamp(off_s)
     scene.says(level, words)
@@ -142,9 +139,7 @@ def test_stamps_off_this_machines_clock_are_told_once_and_only_without_a_clock(
         (86400.0, 'The last stamp is 1 d ahead of the newest one used.'),
     ],
 )
-def test_stamps_that_are_not_believed_are_told_by_how_far_they_are_off(
-    off_s: float, words: str
-) -> None:
+def test_stamps_that_are_not_believed_are_told_by_how_far_they_are_off(off_s, words):
     scene, newest_ns = Scene(), time.time_ns()
     scene.note(OPENING, 0, 50.0, newest_ns + round(off_s * NS_PER_S))
     scene.counts[OPENING]['time_outlier'] = 4
@@ -154,7 +149,7 @@ def test_stamps_that_are_not_believed_are_told_by_how_far_they_are_off(
     scene.says(Level.ERROR, words, newest_ns=newest_ns, at=NOW + 20.0)
 
 
-def test_silence_from_the_start_and_after_speech() -> None:
+def test_silence_from_the_start_and_after_speech():
     scene = Scene()
     scene.silence()
     scene.says(Level.OK, 'Waiting for /plant/valve_opening', listening=1.0)
@@ -168,7 +163,7 @@ def test_silence_from_the_start_and_after_speech() -> None:
     scene.says(Level.STALE, '/plant/valve_opening has been silent for 3.5 s')
 
 
-def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
+def test_a_stamped_sample_speaks_for_all_its_signals():
     scene = Scene(stamped=True)
     # Its quality was left alone; that is no reading, and is not counted.
     scene.says(Level.OK, 'leaves valve_command_quality at 0, unknown', COMMAND)
@@ -179,7 +174,7 @@ def test_a_stamped_sample_speaks_for_all_its_signals() -> None:
 
 
 @pytest.mark.parametrize('stamped', [True, False])
-def test_a_command_that_was_never_sent_is_no_warning(stamped: bool) -> None:
+def test_a_command_that_was_never_sent_is_no_warning(stamped):
     """Not even where the sample that could bring it is silent, or comes from two."""
     scene = Scene(stamped=True)
     if stamped:
@@ -196,7 +191,7 @@ def test_a_command_that_was_never_sent_is_no_warning(stamped: bool) -> None:
     scene.says(Level.STALE, 'has been silent', COMMAND, at=NOW + 60.0)
 
 
-def test_a_silent_covariate_is_told_without_a_warning() -> None:
+def test_a_silent_covariate_is_told_without_a_warning():
     scene, name, topic = Scene(), 'covariate vacuum', '/condenser/pressure'
     scene.health = InputHealth(Settings(), {name: topic, **TOPICS})
     scene.statistics[name] = TopicStatistics()
@@ -209,7 +204,7 @@ def test_a_silent_covariate_is_told_without_a_warning() -> None:
     scene.says(Level.ERROR, 'which the monitor cannot take', name)
 
 
-def test_publishers_that_do_not_fit_are_named() -> None:
+def test_publishers_that_do_not_fit_are_named():
     scene = Scene()
     scene.publishers[OPENING] = Publishers(1, ('std_msgs/msg/Float32',))
     scene.says(Level.ERROR, '/plant/valve_opening is published as std_msgs/msg/Float32')
@@ -220,7 +215,7 @@ def test_publishers_that_do_not_fit_are_named() -> None:
     scene.says(Level.ERROR, '/plant/plant_sample is published as std_msgs/msg/String')
 
 
-def test_a_signal_that_comes_in_two_ways_is_named() -> None:
+def test_a_signal_that_comes_in_two_ways_is_named():
     scene = Scene()
     scene.publishers[PLANT_SAMPLE] = Publishers(1)
     # Somebody could send samples and does not.
@@ -233,7 +228,7 @@ def test_a_signal_that_comes_in_two_ways_is_named() -> None:
     scene.says(Level.OK, 'Hz')
 
 
-def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent() -> None:
+def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent():
     scene, counts = Scene(), Scene().counts[OPENING]
     scene.counts[OPENING] = counts
     counts['accepted'] = 5
@@ -253,7 +248,7 @@ def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent() -> None:
     scene.says(Level.WARN, 'rejected', at=NOW + 30.5)
 
 
-def test_losses_are_said_once_and_counted_on() -> None:
+def test_losses_are_said_once_and_counted_on():
     scene = Scene()
     scene.statistics[OPENING].lost = 3
     scene.says(Level.WARN, '3 messages of /plant/valve_opening were lost')
@@ -278,8 +273,8 @@ def test_losses_are_said_once_and_counted_on() -> None:
     ],
 )  # fmt: skip
 def test_an_impossible_value_is_told_as_sent_with_the_unit_it_would_fit(
-    stamped: bool, settings: dict[str, object], topic: str, value: float, words: str
-) -> None:
+    stamped, settings, topic, value, words
+):
     scene = Scene(stamped, **settings)
     signal = next(info.signal for info in SIGNALS if info.topic == topic)
     scene.note(PLANT_SAMPLE if stamped else topic, signal, value)
@@ -288,7 +283,7 @@ def test_an_impossible_value_is_told_as_sent_with_the_unit_it_would_fit(
     scene.says(Level.OK, 'Hz', topic)
 
 
-def test_other_rejections_are_told_by_reason_and_those_of_earlier_runs_are_no_news() -> None:
+def test_other_rejections_are_told_by_reason_and_those_of_earlier_runs_are_no_news():
     scene = Scene()
     counts = scene.counts[OPENING]
     counts['duplicate'] = 40
@@ -306,13 +301,13 @@ def test_other_rejections_are_told_by_reason_and_those_of_earlier_runs_are_no_ne
 
 
 @pytest.mark.parametrize('what', ['without_time', 'waiting'])
-def test_a_topic_without_any_time_points_to_the_clock(what: str) -> None:
+def test_a_topic_without_any_time_points_to_the_clock(what):
     scene = Scene()
     setattr(scene.statistics[OPENING], what, scene.statistics[OPENING].received)
     scene.says(Level.ERROR, 'is /clock published?')
 
 
-def test_the_message_follows_rep_107() -> None:
+def test_the_message_follows_rep_107():
     items = [
         Item('input valve_opening', Level.OK, 'Fine.', {'Rate (Hz)': 1.0, 'Age (s)': None}),
         Item('recorder', Level.ERROR, 'Broken.', {'On': False, 'Shift (MW)': math.nan}),
@@ -329,7 +324,7 @@ def test_the_message_follows_rep_107() -> None:
         assert bytes([level]) == getattr(DiagnosticStatus, level.name)
 
 
-def test_changes_get_into_the_log_not_too_often_but_a_failure_at_once() -> None:
+def test_changes_get_into_the_log_not_too_often_but_a_failure_at_once():
     well, ill = Item('a', Level.OK, 'Well.'), Item('a', Level.WARN, 'Ill.')
     dead = Item('a', Level.ERROR, 'Dead.')
     for course in (
@@ -354,9 +349,9 @@ def test_changes_get_into_the_log_not_too_often_but_a_failure_at_once() -> None:
         (JournalKind.SETTINGS, '', None),
     ],
 )
-def test_what_the_engine_says_gets_into_the_log(kind: JournalKind, text: str, line: Any) -> None:
+def test_what_the_engine_says_gets_into_the_log(kind, text, line):
     assert line_of(JournalEntry(0, kind, 0, 0, '', text)) == line
-    task: Any = None
+    task = None
     found = '{"verdict": "named", "sentence": "It sticks."}'
     assert line_of(Diagnosed(task, '', 'Why.')) == (Level.WARN, 'no diagnosis: Why.')
     assert line_of(Diagnosed(task, found, '')) == (Level.WARN, 'diagnosis: It sticks.')
@@ -365,26 +360,26 @@ def test_what_the_engine_says_gets_into_the_log(kind: JournalKind, text: str, li
 # The curve, its reference and its alarms
 
 WORK = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_limit': 500.0})
-WORKER: Any = SimpleNamespace(failures_in_a_row=0, busy_s=None, starts=1)
+WORKER = SimpleNamespace(failures_in_a_row=0, busy_s=None, starts=1)
 STRAIGHT = f'{NOT_REFINED}one straight piece, without dynamics.'
 ALONE = 'Piece 1 (u 1000 to 1400) has no data in special segments, so its slope is uncertain.'
 
 
 @pytest.fixture(scope='module')
-def monitor() -> Monitor:
+def monitor():
     made = Monitor(WORK)
     feed_rows(made, simulate(0.3, 7).table)
     return made
 
 
-def said_of(monitor: Monitor, notes: tuple[str, ...], identifiable: bool = True) -> Item:
+def said_of(monitor, notes, identifiable=True):
     """Return what is said of the running curve with other notes."""
     curve = monitor.characteristic
     assert curve is not None
     support = (Support(1, 1, 100, (1200.0,), identifiable),)
     source = replace(curve.source, temperature_flag=False)
     other = replace(curve, notes=notes, support=support, source=source)
-    seen: Any = SimpleNamespace(
+    seen = SimpleNamespace(
         characteristic=other, noise=monitor.noise, status=monitor.status, rows=monitor.rows,
         segments=1, special_samples=100, last_ns=monitor.last_ns, cause='',
     )  # fmt: skip
@@ -393,14 +388,14 @@ def said_of(monitor: Monitor, notes: tuple[str, ...], identifiable: bool = True)
     return item
 
 
-def test_what_is_not_learnt_yet_is_unknown(monitor: Monitor) -> None:
+def test_what_is_not_learnt_yet_is_unknown(monitor):
     for made, known in ((Monitor(WORK), False), (monitor, True)):
         values = fit_item(made, WORKER, None).values
         for name in ('Noise of the power (MW)', 'Temperature spread (K)'):
             assert (values[name] is not None) == known
 
 
-def test_a_weak_curve_says_so(monitor: Monitor) -> None:
+def test_a_weak_curve_says_so(monitor):
     assert said_of(monitor, ('Manual step test: 19 of 19 levels count.',)).level == Level.OK
     for notes, identifiable in (((STRAIGHT,), True), ((ALONE,), False)):
         item = said_of(monitor, notes, identifiable)
@@ -409,12 +404,12 @@ def test_a_weak_curve_says_so(monitor: Monitor) -> None:
     assert (both.level, both.sentence) == (Level.WARN, f'{STRAIGHT} Weak points in all: 2.')
 
 
-def lifted(curve: Characteristic, by_mw: float) -> Characteristic:
+def lifted(curve, by_mw):
     pieces = tuple(replace(p, intercept=p.intercept + by_mw) for p in curve.pieces)
     return replace(curve, pieces=pieces, model_id='lifted')
 
 
-def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
+def test_an_alarm_whose_range_left_the_window_says_so(monitor):
     curve = monitor.characteristic
     assert curve is not None
     assert 'There is no reference curve yet' in reference_item(Monitor(WORK)).sentence
@@ -436,7 +431,7 @@ def test_an_alarm_whose_range_left_the_window_says_so(monitor: Monitor) -> None:
     assert f'{ends}. ' in item.sentence
 
 
-def after(values: list[float], shelved: bool = False) -> Item:
+def after(values, shelved=False):
     """Return what diagnostics say after a second of each value."""
     nervous = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_suppress_time': 60.0}
     alarm = ResidualAlarm(Settings(nervous))
@@ -445,11 +440,11 @@ def after(values: list[float], shelved: bool = False) -> Item:
     alarm.feed(time_ns, column, column, 'm')
     if shelved:
         assert alarm.operate(AlarmAction.SHELVE, int(time_ns[-1]), 'm')[0]
-    monitor: Any = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
+    monitor = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
     return alarm_item(monitor)
 
 
-def test_diagnostics_tell_states_that_no_announcement_told() -> None:
+def test_diagnostics_tell_states_that_no_announcement_told():
     item = after([2.0, 0.0] * 5 + [2.0])
     assert (item.level, item.values['State']) == (Level.ERROR, 'unacknowledged')
     assert item.values['Occurrences in all runs'] == 6

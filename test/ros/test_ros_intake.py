@@ -1,7 +1,5 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -38,26 +36,26 @@ NOW = T0 + NS_PER_S  # later than anything was received
 class Queue:
     """A source that gives what was put in."""
 
-    def __init__(self) -> None:
-        self.waiting: list[RawMessage] = []
+    def __init__(self):
+        self.waiting = []
 
-    def put(self, data: bytes, sent: int, received: int | None = None, number: int = 0) -> None:
+    def put(self, data, sent, received=None, number=0):
         self.waiting.append(RawMessage(data, sent, sent if received is None else received, number))
 
-    def take(self, most: int = DEPTH) -> list[RawMessage]:
+    def take(self, most=DEPTH):
         taken, self.waiting = self.waiting[:most], self.waiting[most:]
         return taken
 
 
-def intake_of(names: list[str], clock: Queue | None = None, **values: object
-              ) -> tuple[dict[str, Queue], Intake]:  # fmt: skip
+def intake_of(names, clock=None, **values
+              ):  # fmt: skip
     settings = Settings(values)
     queues = {name: Queue() for name in names}
     made = Intake(queues, Decoder(settings), LogClock(), settings.text('stamp_source'), clock)
     return queues, made
 
 
-def sample(time_ns: int, **values: float) -> PlantSample:
+def sample(time_ns, **values):
     message = PlantSample()
     message.header.stamp = to_time(time_ns)
     for info in SIGNALS:
@@ -70,7 +68,7 @@ def sample(time_ns: int, **values: float) -> PlantSample:
 
 
 @given(st.lists(st.integers(-(10**12), 10**12), max_size=50))
-def test_log_times_increase_strictly_and_are_never_before_the_receipt(offsets: list[int]) -> None:
+def test_log_times_increase_strictly_and_are_never_before_the_receipt(offsets):
     clock, last = LogClock(), -1
     for offset in offsets:
         stamp = clock.stamp(T0 + offset)
@@ -89,7 +87,7 @@ def test_log_times_increase_strictly_and_are_never_before_the_receipt(offsets: l
         ('source', 0, 0, NOW),
     ],
 )
-def test_the_time_of_a_plain_value(source: str, sent: int, received: int, time_ns: int) -> None:
+def test_the_time_of_a_plain_value(source, sent, received, time_ns):
     queues, intake = intake_of(['valve_opening'], stamp_source=source)
     queues['valve_opening'].put(float64_bytes(50.0), sent, received)
     (arrival,) = intake.collect(0.0, NOW, last=True)
@@ -97,7 +95,7 @@ def test_the_time_of_a_plain_value(source: str, sent: int, received: int, time_n
     assert intake.rows([arrival]) == [(time_ns, Signal.VALVE_OPENING, 50.0, Quality.GOOD)]
 
 
-def test_a_value_gets_the_clock_that_was_sent_before_it_however_late_that_is_taken() -> None:
+def test_a_value_gets_the_clock_that_was_sent_before_it_however_late_that_is_taken():
     clock = Queue()
     queues, intake = intake_of(['valve_opening', 'generated_power'], clock)
     # Three instants are taken at once; two clock messages are still on their way.
@@ -127,9 +125,7 @@ def test_a_value_gets_the_clock_that_was_sent_before_it_however_late_that_is_tak
     st.lists(st.integers(1, 400), max_size=12),
     st.booleans(),
 )
-def test_however_the_looks_fall_the_order_is_that_of_receipt(
-    sent: list[tuple[int, int]], steps: list[int], with_clock: bool
-) -> None:
+def test_however_the_looks_fall_the_order_is_that_of_receipt(sent, steps, with_clock):
     names = ['valve_command', 'valve_opening', 'generated_power', 'main_steam_pressure']
     queues, intake = intake_of(names, Queue() if with_clock else None)
     waiting = sorted((at * 10_000, which) for at, which in sent)
@@ -150,7 +146,7 @@ def test_however_the_looks_fall_the_order_is_that_of_receipt(
     assert [topic for _, topic in order] == [topic for _, topic in expected]
 
 
-def test_more_than_a_look_can_take_keeps_the_other_topics_waiting() -> None:
+def test_more_than_a_look_can_take_keeps_the_other_topics_waiting():
     queues, intake = intake_of(['valve_opening', 'generated_power'])
     for k in range(DEPTH + 50):
         for name in queues:
@@ -162,14 +158,14 @@ def test_more_than_a_look_can_take_keeps_the_other_topics_waiting() -> None:
     assert len(times) == 2 * DEPTH + 100 - DEPTH // 2
 
 
-def test_a_clock_set_back_holds_nothing_for_long() -> None:
+def test_a_clock_set_back_holds_nothing_for_long():
     queues, intake = intake_of(['valve_opening'])
     queues['valve_opening'].put(float64_bytes(1.0), T0 + 3600 * NS_PER_S)
     found = [len(intake.collect(0.02 * k, T0 + k)) for k in range(5)]
     assert found == [0, 0, 1, 0, 0]
 
 
-def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_time() -> None:
+def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_time():
     clock = Queue()
     queues, intake = intake_of(['valve_opening', 'generated_power', PLANT_SAMPLE], clock)
     for k in range(4):
@@ -192,7 +188,7 @@ def test_what_is_sent_before_the_first_clock_waits_for_it_and_stands_before_its_
     assert len(intake.rows(found)) == 5
 
 
-def test_not_too_many_wait_for_a_clock_that_never_comes() -> None:
+def test_not_too_many_wait_for_a_clock_that_never_comes():
     queues, intake = intake_of(['valve_opening'], Queue())
     found = []
     for k in range(MAX_WAITING + 2000):
@@ -206,7 +202,7 @@ def test_not_too_many_wait_for_a_clock_that_never_comes() -> None:
     assert {a.time_ns for a in found} == {0}
 
 
-def test_nothing_waits_long_for_a_clock_that_never_comes() -> None:
+def test_nothing_waits_long_for_a_clock_that_never_comes():
     queues, intake = intake_of(['valve_opening'], Queue())
     found = []
     for k in range(100):
@@ -227,13 +223,13 @@ def test_nothing_waits_long_for_a_clock_that_never_comes() -> None:
         (PLANT_SAMPLE, encode(sample(T0))[:40]),
     ],
 )
-def test_what_cannot_be_read_is_counted_and_not_fed(name: str, data: bytes) -> None:
+def test_what_cannot_be_read_is_counted_and_not_fed(name, data):
     _, intake = intake_of([name])
     assert intake.rows([Arrival(name, data, T0, T0)]) == []
     assert intake.statistics[name].malformed == 1
 
 
-def test_units_are_converted_at_the_door() -> None:
+def test_units_are_converted_at_the_door():
     units = {
         'valve_opening_unit': 'fraction', 'main_steam_pressure_unit': 'bar',
         'main_steam_temperature_unit': 'K', 'generated_power_unit': 'kW',
@@ -252,7 +248,7 @@ def test_units_are_converted_at_the_door() -> None:
         assert found == pytest.approx(expected, rel=1e-15)
 
 
-def test_both_byte_orders_are_read() -> None:
+def test_both_byte_orders_are_read():
     big = b'\x00\x00\x00\x00' + float64_bytes(1.5)[4:][::-1]
     assert Decoder(Settings()).rows('valve_opening', big, T0)[0][2] == 1.5
     assert header_time_ns(
@@ -260,7 +256,7 @@ def test_both_byte_orders_are_read() -> None:
     ) == (7 * NS_PER_S + 9)
 
 
-def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
+def test_a_sample_gives_a_reading_a_signal_the_optional_one_first():
     decoder = Decoder(Settings())
     message = sample(T0, valve_opening=50.0, generated_power=math.nan, valve_command=51.0)
     message.main_steam_pressure_quality = PlantSample.QUALITY_UNCERTAIN
@@ -275,7 +271,7 @@ def test_a_sample_gives_a_reading_a_signal_the_optional_one_first() -> None:
     assert math.isnan(by_signal[Signal.GENERATED_POWER][2])
 
 
-def test_parameters_that_do_not_agree_with_a_sample_are_told() -> None:
+def test_parameters_that_do_not_agree_with_a_sample_are_told():
     given = {'main_steam_pressure_unit': 'bar', 'valve_command_unit': 'fraction', 'unit_tag': 'U1'}
     message = sample(T0)
     message.header.frame_id = 'U2'
@@ -293,7 +289,7 @@ def test_parameters_that_do_not_agree_with_a_sample_are_told() -> None:
     assert sample_warnings(encode(message), fitting) == []
 
 
-def test_a_value_whose_quality_was_not_set_is_not_used() -> None:
+def test_a_value_whose_quality_was_not_set_is_not_used():
     message = PlantSample(valve_opening=50.0, main_steam_pressure=13.0, valve_command=50.0)
     rows = Decoder(Settings()).rows(PLANT_SAMPLE, encode(message), T0)
     # A command that is not sent is no reading.
@@ -303,9 +299,7 @@ def test_a_value_whose_quality_was_not_set_is_not_used() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 1000), st.integers(1, 10**6)), max_size=60))
-def test_the_clock_track_answers_as_a_search_through_all_would(
-    noted: list[tuple[int, int]],
-) -> None:
+def test_the_clock_track_answers_as_a_search_through_all_would(noted):
     track = ClockTrack()
     for sent, shown in noted:
         track.note(sent, shown)
@@ -315,7 +309,7 @@ def test_the_clock_track_answers_as_a_search_through_all_would(
         assert track.at(asked) == expected
 
 
-def test_the_clock_track_stays_bounded_and_forgets_the_beginning() -> None:
+def test_the_clock_track_stays_bounded_and_forgets_the_beginning():
     track = ClockTrack()
     assert (track.first_ns, track.lead_ns(5)) == (0, 0)
     for k in range(100_000):
@@ -327,9 +321,7 @@ def test_the_clock_track_stays_bounded_and_forgets_the_beginning() -> None:
 
 
 @pytest.mark.parametrize(('numbers', 'lost', 'missed'), [((1, 2, 5, 6, 10), 5, 0), ((8,), 0, 7)])
-def test_gaps_in_the_numbers_are_losses_but_not_before_the_first(
-    numbers: tuple[int, ...], lost: int, missed: int
-) -> None:
+def test_gaps_in_the_numbers_are_losses_but_not_before_the_first(numbers, lost, missed):
     statistics = TopicStatistics()
     for number in numbers:
         statistics.note_number(number)
@@ -342,9 +334,7 @@ def test_gaps_in_the_numbers_are_losses_but_not_before_the_first(
     st.integers(1, 5000), st.integers(1, 5000), st.floats(0.0, 1.0), st.integers(1, 40),
     st.integers(0, 2**32 - 1),
 )  # fmt: skip
-def test_two_publishers_never_invent_a_loss(
-    first: int, second: int, share: float, seconds: int, seed: int
-) -> None:
+def test_two_publishers_never_invent_a_loss(first, second, share, seconds, seed):
     """Nothing is lost; whoever sends, at whatever rate, in whatever bursts."""
     rng = np.random.default_rng(seed)
     statistics, numbers = TopicStatistics(), [first, second]
@@ -358,9 +348,7 @@ def test_two_publishers_never_invent_a_loss(
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 20), st.integers(0, 30), st.integers(0, 2**32 - 1))
-def test_losses_are_counted_again_when_one_publisher_is_left(
-    alone: int, both: int, seed: int
-) -> None:
+def test_losses_are_counted_again_when_one_publisher_is_left(alone, both, seed):
     rng = np.random.default_rng(seed)
     statistics, numbers = TopicStatistics(), [1, 900]
     for _ in range(alone):
@@ -384,7 +372,7 @@ def test_losses_are_counted_again_when_one_publisher_is_left(
     assert statistics.lost == before + 3
 
 
-def test_another_publisher_after_a_pause_or_for_a_moment_invents_no_loss() -> None:
+def test_another_publisher_after_a_pause_or_for_a_moment_invents_no_loss():
     statistics = TopicStatistics()
     for number in (1, 2, 3):
         statistics.note_number(number)
@@ -398,7 +386,7 @@ def test_another_publisher_after_a_pause_or_for_a_moment_invents_no_loss() -> No
     assert statistics.lost == 0
 
 
-def test_a_restarted_publisher_is_one_irregularity() -> None:
+def test_a_restarted_publisher_is_one_irregularity():
     statistics = TopicStatistics()
     for number in (5, 6, 7, 1, 2, 3):
         statistics.note_number(number)
@@ -412,7 +400,7 @@ def test_a_restarted_publisher_is_one_irregularity() -> None:
 
 
 @pytest.mark.parametrize(('period', 'limit'), [(0.01, 2.0), (1.0, 2.5), (30.0, 75.0)])
-def test_silence_is_told_by_the_topics_own_period(period: float, limit: float) -> None:
+def test_silence_is_told_by_the_topics_own_period(period, limit):
     statistics = TopicStatistics()
     assert statistics.age_s(0.0) is None
     for k in range(100):
@@ -423,7 +411,7 @@ def test_silence_is_told_by_the_topics_own_period(period: float, limit: float) -
     assert statistics.stale(last + 1.02 * limit)
 
 
-def test_the_rate_does_not_depend_on_how_often_is_looked() -> None:
+def test_the_rate_does_not_depend_on_how_often_is_looked():
     every, rarely = TopicStatistics(), TopicStatistics()
     for k in range(1, 1001):
         every.note_arrival(1, 0.01 * k)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files: what they declare, and that every argument is explained."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,7 @@ LAUNCH = ROOT / 'launch'
 PYTHON = ['monitor.launch.py', 'replay.launch.py', 'demo.launch.py', 'units.launch.py']
 
 
-def test_the_yaml_twin_explains_its_arguments_and_uses_them_all() -> None:
+def test_the_yaml_twin_explains_its_arguments_and_uses_them_all():
     text = (LAUNCH / 'monitor.launch.yaml').read_text()
     content = yaml.safe_load(text)['launch']
     arguments = {entry['arg']['name']: entry['arg'] for entry in content if 'arg' in entry}
@@ -30,7 +28,7 @@ def test_the_yaml_twin_explains_its_arguments_and_uses_them_all() -> None:
 
 
 @pytest.mark.parametrize('name', PYTHON)
-def test_python_launch_files_explain_their_arguments(name: str) -> None:
+def test_python_launch_files_explain_their_arguments(name):
     code = compile((LAUNCH / name).read_text(), name, 'exec')
     assert 'generate_launch_description' in code.co_names
     pytest.importorskip('launch_ros', reason='needs ros2/launch_ros, of which there is no wheel')
@@ -48,7 +46,7 @@ def test_python_launch_files_explain_their_arguments(name: str) -> None:
         assert argument.description.strip().endswith('.'), argument.name
 
 
-def test_the_list_of_units_is_read_beside_its_files(tmp_path: Path) -> None:
+def test_the_list_of_units_is_read_beside_its_files(tmp_path):
     for name in ('u1.yaml', 'u2.yaml', 'opcua.yaml'):
         (tmp_path / name).touch()
     path = tmp_path / 'units.yaml'
@@ -71,7 +69,7 @@ def test_the_list_of_units_is_read_beside_its_files(tmp_path: Path) -> None:
          "two units have the namespace '/u1'"),
     ],
 )  # fmt: skip
-def test_a_list_that_cannot_be_used_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+def test_a_list_that_cannot_be_used_is_refused(tmp_path, text, sentence):
     path = tmp_path / 'units.yaml'
     path.write_text(text)
     with pytest.raises(ValveflowError, match=sentence):

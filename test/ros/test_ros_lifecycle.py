@@ -2,13 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node in this process: its life, what it refuses, and what it says meanwhile."""
 
-from __future__ import annotations
-
 import os
 import time
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -45,48 +40,48 @@ DONE = TransitionCallbackReturn.SUCCESS
 class Stage(Listener):
     """A monitor that does nothing by itself, and somebody who talks to it."""
 
-    def __init__(self, context: Any, folder: Path, **more: object) -> None:
+    def __init__(self, context, folder, **more):
         given = {
             'record_directory': str(folder), 'diagnostics_period': 0.1, 'unit_tag': 'HV 101/2',
             **more,
         }  # fmt: skip
         overrides = [Parameter(name, value=value) for name, value in given.items()]
-        self.told: list[str] = []
+        self.told = []
         self.monitor = MonitorNode(context=context, parameter_overrides=overrides)
         usual = self.monitor._log
         self.monitor._log = lambda level, text: self.told.append(text) or usual(level, text)
         super().__init__(context)
 
-    def start(self) -> Any:
+    def start(self):
         assert self.monitor.trigger_configure() == self.monitor.trigger_activate() == DONE
         return self.monitor.session
 
-    def turn(self) -> None:
+    def turn(self):
         """Let the monitor's loop do a bit of work."""
         self.monitor.step()
         monitor_node.serve_requests(self.monitor, 1.0)
 
-    def until(self, condition: Any, what: str, patience_s: float = 20.0) -> Any:
+    def until(self, condition, what, patience_s=20.0):
         return super().until(lambda: self.turn() or condition(), what, patience_s)
 
-    def sentence(self, item: str) -> str:
+    def sentence(self, item):
         self.health.clear()
         self.until(lambda: self.health, 'health')
         found = self.status(item)
         return found.message if found else ''
 
-    def close(self) -> None:
+    def close(self):
         self.monitor.end_session()
         super().close()
         self.monitor.destroy_node()
 
 
 @pytest.fixture
-def staged(context: Any, tmp_path: Path) -> Iterator[Any]:
+def staged(context, tmp_path):
     """A function that makes a stage; it is closed after the test."""
-    made: list[Stage] = []
+    made = []
 
-    def make(folder: Path = tmp_path, **more: object) -> Stage:
+    def make(folder=tmp_path, **more):
         made.append(Stage(context, folder, **more))
         return made[-1]
 
@@ -95,7 +90,7 @@ def staged(context: Any, tmp_path: Path) -> Iterator[Any]:
         stage.close()
 
 
-def test_the_whole_life(staged: Any, tmp_path: Path) -> None:
+def test_the_whole_life(staged, tmp_path):
     # Each life by itself: with a state the second would go on with the first one's recording.
     stage = staged(keep_state=False, **{
         'qos_overrides./valveflow_monitor/diagnosis.publisher.depth': 7,
@@ -106,7 +101,7 @@ def test_the_whole_life(staged: Any, tmp_path: Path) -> None:
     best_effort = QoSProfile(depth=3, reliability=ReliabilityPolicy.BEST_EFFORT)
     power = stage.node.create_publisher(Float64, '/generated_power', best_effort)
 
-    def reliability(topic: str) -> str:
+    def reliability(topic):
         (seen,) = monitor.get_subscriptions_info_by_topic(topic)
         return seen.qos_profile.reliability.name.lower()
 
@@ -168,16 +163,14 @@ def test_the_whole_life(staged: Any, tmp_path: Path) -> None:
     ],
 )
 def test_a_quality_of_service_that_there_is_not_is_refused_at_the_start(
-    staged: Any, policy: str, value: object, words: str
-) -> None:
+    staged, policy, value, words
+):
     name = f'qos_overrides./valve_opening.subscription.{policy}'
     with pytest.raises(ParameterError, match=words):
         staged(**{name: value})
 
 
-def test_an_active_monitor_answers_all_and_tells_what_it_sees(
-    staged: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_active_monitor_answers_all_and_tells_what_it_sees(staged, tmp_path, monkeypatch):
     monkeypatch.setattr(monitor_node, '_LOOK_AROUND_S', 0.05)
     stage = staged(main_steam_pressure_unit='bar', record_flush=60.0)
     session = stage.start()
@@ -189,7 +182,7 @@ def test_an_active_monitor_answers_all_and_tells_what_it_sees(
     a_curve_is_on_disk_before_anybody_is_told(stage, session, tmp_path, monkeypatch)
 
 
-def requests_that_wait_are_all_answered_in_one_turn(stage: Stage) -> None:
+def requests_that_wait_are_all_answered_in_one_turn(stage):
     names = ('refit', 'acknowledge_alarms')
     clients = [stage.node.create_client(Trigger, f'/valveflow_monitor/{n}') for n in names]
     wait_until(lambda: all(c.service_is_ready() for c in clients), 'the services', 20.0)
@@ -204,7 +197,7 @@ def requests_that_wait_are_all_answered_in_one_turn(stage: Stage) -> None:
     assert not any(answer.result().success for answer in asked)
 
 
-def what_cannot_be_done_is_answered_and_ends_nothing(stage: Stage) -> None:
+def what_cannot_be_done_is_answered_and_ends_nothing(stage):
     # A manager that knows no better asks for a transition that is not to be had.
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
     assert not stage.call(ChangeState, 'change_state', request).success
@@ -219,7 +212,7 @@ def what_cannot_be_done_is_answered_and_ends_nothing(stage: Stage) -> None:
     assert (result.successful, 'cannot be done' in result.reason) == (False, True)
 
 
-def another_node_of_the_same_name_is_told(stage: Stage) -> None:
+def another_node_of_the_same_name_is_told(stage):
     assert stage.sentence(' name') == ''
     twin = Node('valveflow_monitor', context=stage.node.context, start_parameter_services=False)
     wait_until(lambda: stage.sentence(' name'), 'the name', 20.0)
@@ -228,7 +221,7 @@ def another_node_of_the_same_name_is_told(stage: Stage) -> None:
     wait_until(lambda: not stage.sentence(' name'), 'its end', 20.0)
 
 
-def a_sample_that_does_not_agree_with_the_parameters_is_told_once(stage: Stage) -> None:
+def a_sample_that_does_not_agree_with_the_parameters_is_told_once(stage):
     publisher = stage.node.create_publisher(PlantSample, '/plant_sample', 10)
     wait_until(lambda: publisher.get_subscription_count(), 'the subscription', 20.0)
     for second in (1, 2):
@@ -238,22 +231,20 @@ def a_sample_that_does_not_agree_with_the_parameters_is_told_once(stage: Stage) 
     assert told == ['main_steam_pressure_unit', 'PlantSample']
 
 
-def a_curve_is_on_disk_before_anybody_is_told(
-    stage: Stage, session: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[int] = []
+def a_curve_is_on_disk_before_anybody_is_told(stage, session, folder, monkeypatch):
+    told = []
     stage.node.create_subscription(
         FlowCharacteristic, '/valveflow_monitor/characteristic',
         lambda message: told.append(message.status), 10,
     )  # fmt: skip
     curve = example_curve(stage.monitor.settings)
     entry = JournalEntry(5, JournalKind.FIT_ADOPTED, 1, 1, curve.model_id, '')
-    on_disk: list[bytes] = []
+    on_disk = []
 
     class Publisher:
         """Looks what a kill at this moment would leave."""
 
-        def publish(self, data: bytes) -> None:
+        def publish(self, data):
             (part,) = folder.glob('valveflow_*/*.part')
             on_disk.append(part.read_bytes())
 
@@ -273,13 +264,11 @@ def a_curve_is_on_disk_before_anybody_is_told(
 # A folder that cannot be recorded into is reported before the engine is loaded.
 
 
-def recorded_to(place: object, record: bool = True) -> Settings:
+def recorded_to(place, record=True):
     return Settings({'record_directory': str(place), 'record': record})
 
 
-def test_a_recording_that_cannot_be_made_keeps_nobody_from_monitoring(
-    staged: Any, tmp_path: Path
-) -> None:
+def test_a_recording_that_cannot_be_made_keeps_nobody_from_monitoring(staged, tmp_path):
     (tmp_path / 'file').write_text('')
     stage = staged(tmp_path / 'file' / 'below')
     session = stage.start()
@@ -288,8 +277,8 @@ def test_a_recording_that_cannot_be_made_keeps_nobody_from_monitoring(
 
 
 def test_a_folder_that_will_do_is_left_as_it_is_and_named_by_its_absolute_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     check_record_directory(recorded_to(tmp_path))
     check_record_directory(recorded_to(tmp_path / 'a' / 'b'))
     assert list(tmp_path.iterdir()) == []
@@ -301,9 +290,7 @@ def test_a_folder_that_will_do_is_left_as_it_is_and_named_by_its_absolute_path(
         check_record_directory(recorded_to('records'))
 
 
-def test_a_folder_that_cannot_be_recorded_into_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_cannot_be_recorded_into_is_refused(tmp_path, monkeypatch):
     (tmp_path / 'file').write_text('')
     below = tmp_path / 'file' / 'records'
     with pytest.raises(RecordingError, match='is not a folder; set record_directory'):

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine as the node runs it gives what it gives offline, however the data are cut."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import hurt_jobs
 import numpy as np
@@ -38,11 +35,11 @@ from valveflow_ros.plant.simulator import DEFAULT_START_NS, simulate
 from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S, Readings, table_to_readings, zone_of
 from valveflow_ros.ros import encoding
-from valveflow_ros.ros.decoding import Row, from_time, journal_entry
+from valveflow_ros.ros.decoding import from_time, journal_entry
 from valveflow_ros.ros.node.diagnostics import Level
 from valveflow_ros.ros.node.engine import LiveEngine, example_curve, example_task
 from valveflow_ros.ros.node.health import diagnosis_item
-from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
+from valveflow_ros.ros.node.outputs import OUTPUTS, Outputs
 from valveflow_ros.ros.node.worker import DiagnosisWorker, WorkerResult
 from valveflow_ros.ros.simulator_main import effects_of
 from valveflow_ros.signals.align import Aligner
@@ -58,12 +55,12 @@ Calls = list[list[Event]]
 class SlowWorker:
     """Gives outcomes a number of looks after they were asked for; may lose one fit."""
 
-    def __init__(self, looks: int, lost: int = -1) -> None:
+    def __init__(self, looks, lost=-1):
         self._looks, self._lost = looks, lost
-        self._waiting: list[tuple[int, WorkerResult]] = []
+        self._waiting = []
         self._look = self._count = 0
 
-    def submit(self, task: Any) -> None:
+    def submit(self, task):
         self._count += 1
         try:
             result = DEAD if self._count == self._lost else fit(task)
@@ -72,51 +69,51 @@ class SlowWorker:
         outcome = WorkerResult(task.request_ns, result, 0.5)
         self._waiting.append((self._look + self._looks, outcome))
 
-    def poll(self) -> list[WorkerResult]:
+    def poll(self):
         self._look += 1
         due = [outcome for look, outcome in self._waiting if look <= self._look]
         self._waiting = [entry for entry in self._waiting if entry[0] > self._look]
         return due
 
 
-def rows_of(readings: Readings) -> list[Row]:
+def rows_of(readings):
     columns = (readings.time_ns, readings.signal, readings.value, readings.quality)
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 ROWS = rows_of(table_to_readings(TABLE))
 # At the end the clock goes back by hours.
-ROWS[-4000:] = [(t - 10**13, *rest) for t, *rest in ROWS[-4000:]]  # type: ignore[misc]
+ROWS[-4000:] = [(t - 10**13, *rest) for t, *rest in ROWS[-4000:]]
 
 
-def run(engine: LiveEngine, size: int, rows: list[Row]) -> Calls:
+def run(engine, size, rows):
     """Feed all rows cut evenly; return the events of each call."""
-    calls: Calls = []
+    calls = []
     for start in range(0, len(rows), size):
         calls += [engine.poll(), engine.feed(rows[start : start + size])]
     return calls
 
 
-def said(calls: Calls, **more: Any) -> list[Output]:
+def said(calls, **more):
     outputs = Outputs('u', **more)
     return [*outputs.latched(), *(output for events in calls for output in outputs.of(events))]
 
 
-def messages(found: list[Output], kind: Any, name: str) -> list[Any]:
+def messages(found, kind, name):
     return [deserialize_message(o.data, kind) for o in found if o.name == name]
 
 
 @pytest.fixture(scope='module')
-def live() -> tuple[LiveEngine, Calls]:
+def live():
     """A fault, a lost fit, an alarm that is acknowledged, two references, a clock set back."""
-    engine = LiveEngine(SETTINGS, SlowWorker(3, lost=3))  # type: ignore[arg-type]
+    engine = LiveEngine(SETTINGS, SlowWorker(3, lost=3))
     calls = [engine.monitor.set_reference(REFERENCE), *run(engine, 500, ROWS[:-5000])]
     calls.append(engine.monitor.operate_alarms(AlarmAction.ACKNOWLEDGE))
     calls.append(engine.monitor.set_reference())
     return engine, [*calls, *run(engine, 500, ROWS[-5000:])]
 
 
-def test_all_that_happens_is_told(live: tuple[LiveEngine, Calls]) -> None:
+def test_all_that_happens_is_told(live):
     engine, calls = live
     found = said(calls)
     assert {output.name for output in found} == set(OUTPUTS)
@@ -134,9 +131,7 @@ def test_all_that_happens_is_told(live: tuple[LiveEngine, Calls]) -> None:
 
 
 @pytest.mark.parametrize('begun_ns', [DEFAULT_START_NS - NS_PER_S, 0])
-def test_who_comes_late_finds_everything_with_a_time(
-    live: tuple[LiveEngine, Calls], begun_ns: int
-) -> None:
+def test_who_comes_late_finds_everything_with_a_time(live, begun_ns):
     _, calls = live
     outputs = Outputs('u', begun_ns=begun_ns)
     first = list(outputs.latched())
@@ -160,9 +155,7 @@ def test_who_comes_late_finds_everything_with_a_time(
         assert (alarm.state, alarm.previous_state, alarm.occurrence) == (Alarm.NORMAL,) * 2 + (0,)
 
 
-def test_replaying_the_journal_says_the_same_byte_for_byte(
-    live: tuple[LiveEngine, Calls],
-) -> None:
+def test_replaying_the_journal_says_the_same_byte_for_byte(live):
     _, calls = live
     expected = said(calls)
     # Through messages and back, as a recording keeps the journal.
@@ -188,30 +181,30 @@ def test_replaying_the_journal_says_the_same_byte_for_byte(
         (JournalKind.DIAGNOSED, 'never asked for'),
     ],
 )
-def test_what_cannot_be_replayed_is_said(kind: JournalKind, words: str) -> None:
+def test_what_cannot_be_replayed_is_said(kind, words):
     entry = JournalEntry(0, kind, 5, 0, 'x', '')
     with pytest.raises(DataError, match=words):
         JournalReplayer(Monitor(SETTINGS), [entry]).feed(TABLE.part(0, 3))
 
 
-def test_the_cutting_of_the_stream_leaves_no_trace() -> None:
+def test_the_cutting_of_the_stream_leaves_no_trace():
     # With an outcome at the next look, a call per row or many rows differ in the boundary at
     # which it is adopted; without fits nothing may differ at all.
     settings = SETTINGS.changed({'refit_period': 0.0})
     rows = ROWS[: len(ROWS) // 4]
     found = []
     for size in (7, 500, len(rows)):
-        engine = LiveEngine(settings, SlowWorker(0))  # type: ignore[arg-type]
+        engine = LiveEngine(settings, SlowWorker(0))
         found.append(said(run(engine, size, rows)))
     assert all(one == found[0] for one in found[1:])
     assert len(found[0]) >= len(TABLE) // 4
 
 
-def test_of_the_alarms_so_many_are_kept_that_none_that_stands_is_buried() -> None:
+def test_of_the_alarms_so_many_are_kept_that_none_that_stands_is_buried():
     assert OUTPUTS['alarms'].kept > BURIED + 1
 
 
-def test_the_messages_follow_reference_and_curve() -> None:
+def test_the_messages_follow_reference_and_curve():
     outputs = Outputs('u')
     told = list(outputs.of([ReferenceSet(REFERENCE)]))
     assert [o.name for o in told] == ['characteristic', 'breakpoints', 'slopes']
@@ -225,7 +218,7 @@ def test_the_messages_follow_reference_and_curve() -> None:
 @pytest.mark.parametrize(('axis', 'units'), [
     ('integrated_input', ['% MPa^e', 'MW / (% MPa^e)']), (OPENING, ['%', 'MW / (% MPa^s)']),
 ])  # fmt: skip
-def test_plain_arrays_say_their_unit(axis: str, units: list[str]) -> None:
+def test_plain_arrays_say_their_unit(axis, units):
     curve = example_curve(SETTINGS)
     object.__setattr__(curve, 'axis', axis)
     told = list(Outputs('u').of([CurveAdopted(curve)]))
@@ -234,7 +227,7 @@ def test_plain_arrays_say_their_unit(axis: str, units: list[str]) -> None:
         assert message.layout.dim[0].label.endswith(f'[{unit}]')
 
 
-def test_what_a_replay_reads_of_the_journal_is_not_told_in_a_zone() -> None:
+def test_what_a_replay_reads_of_the_journal_is_not_told_in_a_zone():
     entry = JournalEntry(0, JournalKind.RESET, 0, 1, '', 'since 2024-01-02 00:30 UTC')
     told = [*Outputs('u', zone=zone_of('+05:00')).of([entry])]
     assert messages(told, JournalMessage, 'journal')[0].text == entry.text
@@ -248,7 +241,7 @@ DAILY = Settings(
 )
 
 
-def test_no_diagnosis_is_unknown_and_says_why() -> None:
+def test_no_diagnosis_is_unknown_and_says_why():
     contents, curve = example_task(Settings()).contents, REFERENCE
     task = DiagnosisTask(5, contents, Settings(), curve, int(contents.time_ns[-1]))
     given = [*Outputs('unit 1').of([Diagnosed(task, '', 'Because.')])], [*Outputs('u').latched()]
@@ -262,11 +255,11 @@ def test_no_diagnosis_is_unknown_and_says_why() -> None:
 
 
 @pytest.mark.usefixtures('jobs_on_path')
-def test_the_night_and_a_hand_bring_a_diagnosis_that_a_replay_repeats() -> None:
+def test_the_night_and_a_hand_bring_a_diagnosis_that_a_replay_repeats():
     unit = replace(UnitDescription(), sample_period_s=STEP_S)
     readings = table_to_readings(simulate(1.25, 5, unit).table)
     worker = DiagnosisWorker(300.0, 'hurt_jobs:diagnosed')
-    engine = LiveEngine(DAILY, SlowWorker(1), worker)  # type: ignore[arg-type]
+    engine = LiveEngine(DAILY, SlowWorker(1), worker)
     with pytest.raises(DataError, match='no curve'):
         engine.request_diagnosis()
     rows = rows_of(readings)
@@ -290,7 +283,7 @@ def test_the_night_and_a_hand_bring_a_diagnosis_that_a_replay_repeats() -> None:
     assert (item.values['Verdict'], item.values['Running']) == ('nothing', False)
     journal = [e for events in calls for e in events if isinstance(e, JournalEntry)]
 
-    def again(task: Any) -> str:
+    def again(task):
         return hurt_jobs.diagnosed(task).text
 
     replayer = JournalReplayer(Monitor(DAILY), journal, again)

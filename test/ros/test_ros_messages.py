@@ -1,10 +1,7 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import math
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
@@ -46,25 +43,25 @@ texts = st.text(st.characters(exclude_characters='\x00', exclude_categories=['Cs
 reals = st.floats(allow_nan=True, allow_infinity=True)
 
 
-def bits(value: float) -> bytes:
+def bits(value):
     return struct.pack('<d', value)
 
 
 @given(times)
-def test_times_survive_the_way_there_and_back(time_ns: int) -> None:
+def test_times_survive_the_way_there_and_back(time_ns):
     assert from_time(encoding.to_time(time_ns)) == time_ns
 
 
 @pytest.mark.parametrize('time_ns', [-1, -(10**18), 2**62, (1 << 31) * NS_PER_S])
-def test_times_that_a_stamp_cannot_hold_become_the_nearest_one(time_ns: int) -> None:
+def test_times_that_a_stamp_cannot_hold_become_the_nearest_one(time_ns):
     nearest = 0 if time_ns < 0 else (1 << 31) * NS_PER_S - 1
     assert from_time(encoding.to_time(time_ns)) == nearest
 
 
 @given(times, st.sampled_from(JournalKind), times, st.integers(0, 2**63), texts, texts, texts)
 def test_the_journal_survives_the_way_through_bytes(
-    time_ns: int, kind: JournalKind, request_ns: int, rows: int, model: str, text: str, tag: str
-) -> None:
+    time_ns, kind, request_ns, rows, model, text, tag
+):
     entry = JournalEntry(time_ns, kind, request_ns, rows, model, text)
     data = encode(encoding.journal_message(entry, tag))
     message = deserialize_message(data, JournalMessage)
@@ -83,12 +80,12 @@ def test_the_journal_survives_the_way_through_bytes(
         (SegmentKind, SpecialSegment),
     ],
 )
-def test_the_engine_and_the_messages_mean_the_same_by_a_number(numbers: Any, message: Any) -> None:
+def test_the_engine_and_the_messages_mean_the_same_by_a_number(numbers, message):
     for member in numbers:
         assert getattr(message, member.name) == member.value
 
 
-def test_quality_codes_are_the_messages() -> None:
+def test_quality_codes_are_the_messages():
     of_code = qualities()
     for quality in Quality:
         assert of_code[getattr(PlantSample, f'QUALITY_{quality.name}')] == quality
@@ -96,7 +93,7 @@ def test_quality_codes_are_the_messages() -> None:
     assert set(of_code[4:]) == {Quality.BAD}
 
 
-def test_a_sample_of_before_the_code_for_unknown_is_sent_with_the_codes_of_now() -> None:
+def test_a_sample_of_before_the_code_for_unknown_is_sent_with_the_codes_of_now():
     then = PlantSample(valve_opening=50.0, generated_power=200.0)
     then.generated_power_quality, then.valve_command_quality = 1, 2
     now = deserialize_message(with_todays_codes(encode(then)), PlantSample)
@@ -107,7 +104,7 @@ def test_a_sample_of_before_the_code_for_unknown_is_sent_with_the_codes_of_now()
         with_todays_codes(b'none')
 
 
-def test_every_field_of_a_segment_and_of_an_alarm_is_carried_over() -> None:
+def test_every_field_of_a_segment_and_of_an_alarm_is_carried_over():
     segment = SegmentRecord(
         7, SegmentKind.SLOPE, 10**18 + 1, 10**18 + 5, 300, 1.5, 2.5, 0.25, 0.125, 100.0, 110.0,
         0.5, 538.25,
@@ -129,7 +126,7 @@ def test_every_field_of_a_segment_and_of_an_alarm_is_carried_over() -> None:
             assert (from_time(found) if isinstance(found, Time) else found) == expected, name
 
 
-def test_what_the_curve_says_of_its_reference() -> None:
+def test_what_the_curve_says_of_its_reference():
     curve = example_curve(Settings()).with_id()
     ends = [(p.u_from, p.u_to) for p in curve.pieces]
     moved = tuple(
@@ -153,7 +150,7 @@ def test_what_the_curve_says_of_its_reference() -> None:
     assert (none.reference_model_id, list(none.shift_mw)) == ('another', [])
 
 
-def test_texts_are_told_in_unit_and_zone_but_names_stay() -> None:
+def test_texts_are_told_in_unit_and_zone_but_names_stay():
     cause = DiagnosisCause(name='MW', sentence='5 MW', parameter_units=['MW', '%'])
     message = Diagnosis(sentence='since 2024-01-02 00:30 UTC', causes=[cause])
     encoding.tell_in(message, 't/h', zone_of('+05:00'))
@@ -162,7 +159,7 @@ def test_texts_are_told_in_unit_and_zone_but_names_stay() -> None:
     assert list(cause.parameter_units) == ['t/h', '%']
 
 
-def test_the_curve_is_drawn_by_arrays_that_fit_each_other() -> None:
+def test_the_curve_is_drawn_by_arrays_that_fit_each_other():
     curve = example_curve(Settings()).with_id()
     message = encoding.curve_message(curve, CurveStatus.FRESH, '', 'u')
     j = len(curve.pieces)
@@ -180,7 +177,7 @@ def test_the_curve_is_drawn_by_arrays_that_fit_each_other() -> None:
         assert drawn == pytest.approx(float(curve(np.array([u]))[0]))
 
 
-def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
+def test_without_a_curve_the_message_says_why_and_gives_no_numbers():
     message = encoding.curve_message(None, CurveStatus.REFUSED, 'Too little.', 'u')
     assert (message.status, message.cause) == (FlowCharacteristic.REFUSED, 'Too little.')
     assert not message.breakpoints
@@ -192,8 +189,8 @@ def test_without_a_curve_the_message_says_why_and_gives_no_numbers() -> None:
 
 @given(times, st.integers(0, 255), texts, texts, st.lists(reals, min_size=8, max_size=8), reals)
 def test_predictions_made_by_hand_are_what_the_encoder_makes(
-    time_ns: int, state: int, model: str, tag: str, numbers: list[float], width: float
-) -> None:
+    time_ns, state, model, tag, numbers, width
+):
     columns = [np.array([x]) for x in numbers]
     kinds = np.array([state], dtype=np.uint8)
     block = PredictionBlock(np.array([time_ns]), *columns, kinds, width, model)
@@ -242,7 +239,7 @@ MESSAGES = [
 
 
 @pytest.mark.parametrize('message', MESSAGES, ids=lambda m: type(m).__name__)
-def test_our_encoding_is_read_by_the_middleware_as_its_own_is(message: Any) -> None:
+def test_our_encoding_is_read_by_the_middleware_as_its_own_is(message):
     kind = type(message)
     ours = deserialize_message(encode(message), kind)
     theirs = deserialize_message(serialize_message(message), kind)
@@ -250,7 +247,7 @@ def test_our_encoding_is_read_by_the_middleware_as_its_own_is(message: Any) -> N
     assert encode(ours) == encode(message)
 
 
-def test_equal_messages_are_equal_bytes_whatever_was_in_memory() -> None:
+def test_equal_messages_are_equal_bytes_whatever_was_in_memory():
     found = set()
     for k in range(50):
         serialize_message(Alarm(sentence='x' * (k * 37)))
@@ -258,10 +255,10 @@ def test_equal_messages_are_equal_bytes_whatever_was_in_memory() -> None:
     assert len(found) == 1
 
 
-def test_a_field_of_an_unknown_kind_is_refused() -> None:
+def test_a_field_of_an_unknown_kind_is_refused():
     class Odd:
         @classmethod
-        def get_fields_and_field_types(cls) -> dict[str, str]:
+        def get_fields_and_field_types(cls):
             return {'text': 'wstring'}
 
     with pytest.raises(TypeError, match='wstring'):
@@ -269,13 +266,13 @@ def test_a_field_of_an_unknown_kind_is_refused() -> None:
 
 
 @given(reals, times)
-def test_the_short_ways_of_two_types_are_those_of_all(value: float, time_ns: int) -> None:
+def test_the_short_ways_of_two_types_are_those_of_all(value, time_ns):
     assert float64_bytes(value) == encode(Float64(data=value))
     assert clock_bytes(time_ns) == encode(Clock(clock=encoding.to_time(time_ns)))
 
 
 @given(arrays.arrays(np.float64, st.integers(0, 50)))
-def test_plain_arrays_say_how_long_they_are(values: np.ndarray) -> None:
+def test_plain_arrays_say_how_long_they_are(values):
     message = encoding.array_message(values, 'what')
     assert bits(0.0).join(map(bits, message.data)) == bits(0.0).join(map(bits, values.tolist()))
     (dimension,) = message.layout.dim

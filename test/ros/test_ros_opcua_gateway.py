@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The OPC UA gateway as a process between real servers and ROS, both ways."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib.util
 import signal
@@ -44,13 +42,13 @@ GATEWAY = 'valveflow_ros.ros.gateway_main'
 class Hearing:
     """Hears samples of units and the gateway's health."""
 
-    def __init__(self, context, *units: str) -> None:
+    def __init__(self, context, *units):
         self.node = Node('hearing', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
-        self.samples: dict[str, list[PlantSample]] = {unit: [] for unit in units}
-        self.health: dict[str, tuple[int, str]] = {}
-        self.values: dict[str, dict[str, str]] = {}
+        self.samples = {unit: [] for unit in units}
+        self.health = {}
+        self.values = {}
         for unit in units:
             self.node.create_subscription(
                 PlantSample, f'{unit}/plant_sample', self.samples[unit].append, 1000

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page beside real monitors: what it shows and asks, kills and starts, and how it ends."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re
@@ -30,17 +28,17 @@ PAGE = 'valveflow_ros.ros.page_main'
 
 
 @pytest.fixture
-def port() -> int:
+def port():
     with socket.create_server(('127.0.0.1', 0)) as free:
         return int(free.getsockname()[1])
 
 
-def page_of(port: int, path: str) -> str:
+def page_of(port, path):
     with urllib.request.urlopen(f'http://127.0.0.1:{port}{path}', timeout=10) as answer:
         return str(answer.read().decode())
 
 
-def metrics(port: int) -> str:
+def metrics(port):
     """Return the metrics, empty while there is no page."""
     try:
         return page_of(port, '/metrics')
@@ -48,7 +46,7 @@ def metrics(port: int) -> str:
         return ''
 
 
-def newest(port: int) -> float:
+def newest(port):
     """Return the time of the newest sample, in seconds."""
     found = re.search(r'^valveflow_sample_timestamp_seconds\S* (\S+)$', metrics(port), re.M)
     return float(found[1]) if found else 0.0
@@ -116,7 +114,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
         f'http://127.0.0.1:{port}/_dash-update-component', json.dumps(content).encode(),
         {'Content-Type': 'application/json'},
     )  # fmt: skip
-    answers: list[str] = []
+    answers = []
 
     def ask():
         with urllib.request.urlopen(request, timeout=20) as found:
@@ -148,7 +146,7 @@ def test_a_monitor_that_is_killed_and_started_again(processes, port, browser):
     browser.look(1280)
     browser.call('Page.navigate', url=f'http://127.0.0.1:{port}/')
 
-    def shows(text: str):
+    def shows(text):
         def found():
             try:
                 return browser.ask(f'document.getElementById("page").innerText.includes({text!r})')

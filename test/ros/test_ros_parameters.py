@@ -1,11 +1,8 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import math
 import shlex
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -16,7 +13,7 @@ from rclpy.parameter import Parameter as RosParameter
 from ros_helpers import wait_until
 
 from valveflow_ros.errors import ParameterError
-from valveflow_ros.parameters import TABLE, Parameter, Settings, as_yaml
+from valveflow_ros.parameters import TABLE, Settings, as_yaml
 from valveflow_ros.ros.declare import changed, declare, unknown_overrides
 from valveflow_ros.ros.node.diagnostics import Level
 from valveflow_ros.ros.node.monitor_node import MonitorNode
@@ -27,12 +24,12 @@ LIVE = [row for row in TABLE if row.live]
 FIXED = [row for row in TABLE if not row.live]
 
 
-def ros(name: str, value: object) -> RosParameter:
+def ros(name, value):
     return RosParameter(name, value=value)
 
 
 @pytest.fixture
-def node(context: Any) -> Any:
+def node(context):
     made = MonitorNode(context=context)
     yield made
     made.destroy_node()
@@ -41,20 +38,20 @@ def node(context: Any) -> Any:
 class Running:
     """A session that a parameter may reach."""
 
-    def reconfigure(self, settings: Settings) -> None:
+    def reconfigure(self, settings):
         self.settings = settings
 
 
 @pytest.fixture
-def running(node: MonitorNode) -> MonitorNode:
+def running(node):
     """The node as it is between configure and clean-up, for its parameters."""
-    node.session = Running()  # type: ignore[assignment]
+    node.session = Running()
     return node
 
 
-def bad_values(row: Parameter) -> list[object]:
+def bad_values(row):
     """Values that do not fit a row, of every kind that ROS can send."""
-    values: list[object] = ['', [1.0, 2.0], [b'\x01'], None]
+    values = ['', [1.0, 2.0], [b'\x01'], None]
     if isinstance(row.default, bool):
         return [*values, 1, 0.5, 'true']
     if isinstance(row.default, str):
@@ -66,20 +63,20 @@ def bad_values(row: Parameter) -> list[object]:
     return values if isinstance(row.default, float) else [*values, row.default + 0.5]
 
 
-def good_values(row: Parameter) -> list[object]:
+def good_values(row):
     if isinstance(row.default, bool | str) or row.low is None or row.high is None:
         return [not row.default] if isinstance(row.default, bool) else [row.default]
     return [row.low, row.high, float(row.default)]
 
 
-def means_the_default(row: Parameter, value: object) -> bool:
+def means_the_default(row, value):
     try:
         return row.check(value) == row.default
     except ParameterError:
         return False
 
 
-def test_every_row_is_declared_with_its_default_and_described(node: MonitorNode) -> None:
+def test_every_row_is_declared_with_its_default_and_described(node):
     for row in TABLE:
         assert node.get_parameter(row.name).value == row.default
         found = node.describe_parameter(row.name)
@@ -97,7 +94,7 @@ def test_every_row_is_declared_with_its_default_and_described(node: MonitorNode)
     assert node.settings == Settings()
 
 
-def test_live_parameters_take_good_values_and_refuse_bad_ones(running: MonitorNode) -> None:
+def test_live_parameters_take_good_values_and_refuse_bad_ones(running):
     node = running
     for row in LIVE:
         for value in good_values(row):
@@ -115,7 +112,7 @@ def test_live_parameters_take_good_values_and_refuse_bad_ones(running: MonitorNo
         assert node.settings is before
 
 
-def test_the_others_stay_while_it_runs_and_may_be_changed_before(running: MonitorNode) -> None:
+def test_the_others_stay_while_it_runs_and_may_be_changed_before(running):
     session = running.session
     for row in FIXED:
         for value in [*good_values(row), *bad_values(row)]:
@@ -138,7 +135,7 @@ def test_the_others_stay_while_it_runs_and_may_be_changed_before(running: Monito
     assert running.settings == Settings()
 
 
-def test_values_have_the_type_of_the_table(context: Any) -> None:
+def test_values_have_the_type_of_the_table(context):
     given = [ros('hold_limit', 20), ros('record_queue', 2000.0)]
     node = MonitorNode(context=context, parameter_overrides=given)
     assert type(node.get_parameter('hold_limit').value) is float
@@ -151,7 +148,7 @@ def test_values_have_the_type_of_the_table(context: Any) -> None:
     node.destroy_node()
 
 
-def test_what_was_dumped_can_be_loaded_while_it_runs(running: MonitorNode) -> None:
+def test_what_was_dumped_can_be_loaded_while_it_runs(running):
     declared = [running.get_parameter(name) for name in running._parameters]
     declared += [ros(row.name, row.default) for row in TABLE]
     for one in declared:
@@ -159,9 +156,7 @@ def test_what_was_dumped_can_be_loaded_while_it_runs(running: MonitorNode) -> No
     assert running.set_parameters_atomically(declared).successful
 
 
-def test_setting_one_after_the_other_is_judged_too_and_together_it_is_all_or_nothing(
-    node: MonitorNode,
-) -> None:
+def test_setting_one_after_the_other_is_judged_too_and_together_it_is_all_or_nothing(node):
     both = [ros('alarm_limit', 5), ros('alarm_dead_band', 0.95)]
     assert not node.set_parameters_atomically(both).successful
     assert node.settings == Settings()
@@ -170,7 +165,7 @@ def test_setting_one_after_the_other_is_judged_too_and_together_it_is_all_or_not
     assert (node.settings['alarm_limit'], node.settings['alarm_dead_band']) == (5.0, 0.3)
 
 
-def test_bad_values_at_the_start_are_refused_with_the_tables_sentence(context: Any) -> None:
+def test_bad_values_at_the_start_are_refused_with_the_tables_sentence(context):
     for row in TABLE:
         node = Node(
             'start', context=context, parameter_overrides=[ros(row.name, bad_values(row)[-1])]
@@ -187,7 +182,7 @@ def test_bad_values_at_the_start_are_refused_with_the_tables_sentence(context: A
         MonitorNode(context=context, parameter_overrides=overrides)
 
 
-def test_misspelt_parameters_are_named(context: Any) -> None:
+def test_misspelt_parameters_are_named(context):
     overrides = [ros('refit_periodd', 30.0), ros('use_sim_time', False), ros('record', False)]
     node = MonitorNode(context=context, parameter_overrides=overrides)
     (sentence,) = unknown_overrides(node)
@@ -198,7 +193,7 @@ def test_misspelt_parameters_are_named(context: Any) -> None:
     node.destroy_node()
 
 
-def test_the_clock_cannot_be_taken_over_while_it_runs(running: MonitorNode) -> None:
+def test_the_clock_cannot_be_taken_over_while_it_runs(running):
     foreign = [ros('start_type_description_service', True)]
     assert changed(Settings(), foreign, running=True) == Settings()
     result = running.set_parameters_atomically([ros('use_sim_time', True)])
@@ -211,15 +206,15 @@ def test_the_clock_cannot_be_taken_over_while_it_runs(running: MonitorNode) -> N
 
 
 @pytest.fixture
-def ask(context: Any, running: MonitorNode) -> Any:
+def ask(context, running):
     """Ask a service of the running node from another one."""
     asking = Node('asking', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(running)
     executor.add_node(asking)
-    clients: dict[str, Any] = {}
+    clients = {}
 
-    def answer(kind: Any, name: str, request: Any) -> Any:
+    def answer(kind, name, request):
         if name not in clients:
             clients[name] = asking.create_client(kind, f'/valveflow_monitor/{name}')
             wait_until(clients[name].service_is_ready, 'the service', 20.0)
@@ -232,7 +227,7 @@ def ask(context: Any, running: MonitorNode) -> Any:
     asking.destroy_node()
 
 
-def test_from_afar_bad_values_come_back_with_the_sentence(ask: Any, running: MonitorNode) -> None:
+def test_from_afar_bad_values_come_back_with_the_sentence(ask, running):
     wanted = [
         ros('alarm_off_delay', math.nan), ros('alarm_off_delay', 'high'), ros('unit_tag', 'x'),
         ros('alarm_off_delay', None), ros('no_such_thing', 1), ros('alarm_off_delay', 6),
@@ -259,7 +254,7 @@ STRANGE_NAMES = [
 ]  # fmt: skip
 
 
-def hostile_wishes() -> list[RosParameter]:
+def hostile_wishes():
     """Everything for every parameter of the table, apart from what a live one may be set to."""
     wishes = [ros(name, value) for name in STRANGE_NAMES for value in (1.0, 'a', None)]
     wishes += [ros('use_sim_time', value) for value in (True, 1, 'yes', None)]
@@ -277,7 +272,7 @@ def hostile_wishes() -> list[RosParameter]:
     return wishes
 
 
-def test_from_afar_nothing_hostile_gets_in(ask: Any, running: MonitorNode) -> None:
+def test_from_afar_nothing_hostile_gets_in(ask, running):
     declared = {name: running.get_parameter(name).value for name in running._parameters}
     wishes = hostile_wishes()
     assert len(wishes) >= 15 * len(TABLE)
@@ -298,14 +293,14 @@ def test_from_afar_nothing_hostile_gets_in(ask: Any, running: MonitorNode) -> No
     assert running.settings == Settings()
 
 
-def test_a_text_of_digits_is_given_as_the_refusal_of_a_number_says(context: Any) -> None:
+def test_a_text_of_digits_is_given_as_the_refusal_of_a_number_says(context):
     written = shlex.split('''--ros-args -p unit_tag:="'7'"''')
     node = MonitorNode(context=context, cli_args=written)
     assert node.settings.text('unit_tag') == '7'
     node.destroy_node()
 
 
-def test_the_parameter_file_is_the_table_and_ros_reads_it_as_the_defaults(context: Any) -> None:
+def test_the_parameter_file_is_the_table_and_ros_reads_it_as_the_defaults(context):
     # After a change of the table:
     #   python -c "from valveflow_ros.parameters import as_yaml; print(as_yaml(), end='')"
     # goes to config/monitor.yaml.

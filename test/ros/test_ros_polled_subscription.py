@@ -1,9 +1,6 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import time
-from typing import Any
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -16,7 +13,6 @@ from valveflow_ros.ros.encoding import encode, float64_bytes
 from valveflow_ros.ros.node.polled_subscription import (
     DEPTH,
     PolledSubscription,
-    RawMessage,
     can_poll,
 )
 
@@ -24,19 +20,19 @@ pytestmark = pytest.mark.ros
 
 
 @pytest.fixture
-def node(context: Any) -> Any:
+def node(context):
     made = Node('polling', context=context)
     yield made
     made.destroy_node()
 
 
-def publisher_for(node: Node, source: PolledSubscription, reliable: bool = True) -> Any:
+def publisher_for(node, source, reliable=True):
     kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
     profile = QoSProfile(depth=DEPTH, reliability=kind)
     return node.create_publisher(Float64, source.topic, profile)
 
 
-def matched(node: Node, source: PolledSubscription) -> Any:
+def matched(node, source):
     publisher = publisher_for(node, source)
     wait_until(lambda: publisher.get_subscription_count() == 1, 'the match')
     # Both sides have matched once a value has come through.
@@ -46,12 +42,10 @@ def matched(node: Node, source: PolledSubscription) -> Any:
     return publisher
 
 
-def collect(
-    source: PolledSubscription, count: int, executor: SingleThreadedExecutor | None = None
-) -> list[RawMessage]:
-    found: list[RawMessage] = []
+def collect(source, count, executor=None):
+    found = []
 
-    def enough() -> bool:
+    def enough():
         if executor is not None:
             executor.spin_once(timeout_sec=0.01)
         found.extend(source.take())
@@ -61,7 +55,7 @@ def collect(
     return found
 
 
-def test_this_rclpy_lets_messages_be_taken_by_hand(node: Node) -> None:
+def test_this_rclpy_lets_messages_be_taken_by_hand(node):
     # If this fails after an update of rclpy, the executor takes over (see the next tests);
     # it costs about eight times the processor time, so better find the new way.
     source = PolledSubscription(node, Float64, 'value')
@@ -70,7 +64,7 @@ def test_this_rclpy_lets_messages_be_taken_by_hand(node: Node) -> None:
 
 
 @pytest.mark.parametrize('polled', [True, False])
-def test_bytes_stamps_and_numbers_come_in_order(node: Node, polled: bool) -> None:
+def test_bytes_stamps_and_numbers_come_in_order(node, polled):
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     source = PolledSubscription(node, Float64, 'value', reliable=True, polled=polled)
@@ -91,7 +85,7 @@ def test_bytes_stamps_and_numbers_come_in_order(node: Node, polled: bool) -> Non
     executor.shutdown()
 
 
-def test_the_executor_leaves_messages_to_who_takes_them_as_many_as_asked_for(node: Node) -> None:
+def test_the_executor_leaves_messages_to_who_takes_them_as_many_as_asked_for(node):
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     source = PolledSubscription(node, Float64, 'value')
@@ -100,7 +94,7 @@ def test_the_executor_leaves_messages_to_who_takes_them_as_many_as_asked_for(nod
         publisher.publish(Float64(data=float(k)))
     for _ in range(50):
         executor.spin_once(timeout_sec=0.0)
-    found: list[RawMessage] = []
+    found = []
     wait_until(lambda: found.extend(source.take(7)) or len(found) >= 7, 'seven')
     assert len(found) <= 13
     assert len(found) + len(collect(source, 30 - len(found))) == 30
@@ -109,7 +103,7 @@ def test_the_executor_leaves_messages_to_who_takes_them_as_many_as_asked_for(nod
     wait_until(lambda: publisher.get_subscription_count() == 0, 'the end', 20.0)
 
 
-def test_best_effort_and_reliable_publishers_are_both_heard(node: Node) -> None:
+def test_best_effort_and_reliable_publishers_are_both_heard(node):
     source = PolledSubscription(node, Float64, 'value')
     for reliable in (True, False):
         publisher = publisher_for(node, source, reliable)
@@ -117,8 +111,8 @@ def test_best_effort_and_reliable_publishers_are_both_heard(node: Node) -> None:
         node.destroy_publisher(publisher)
 
 
-def test_a_publisher_that_does_not_match_is_told(node: Node) -> None:
-    heard: list[str] = []
+def test_a_publisher_that_does_not_match_is_told(node):
+    heard = []
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     source = PolledSubscription(node, Float64, 'value', reliable=True, on_mismatch=heard.append)
@@ -128,7 +122,7 @@ def test_a_publisher_that_does_not_match_is_told(node: Node) -> None:
     executor.shutdown()
 
 
-def test_names_are_resolved_and_remapped(context: Any) -> None:
+def test_names_are_resolved_and_remapped(context):
     options = ['--ros-args', '-r', 'value:=/plant/other']
     node = Node('remapped', context=context, namespace='unit1', cli_args=options)
     assert PolledSubscription(node, Float64, 'value').topic == '/plant/other'

@@ -2,29 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files given to the node: a reference that its curves are judged by, a model of known causes."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import psutil
 import pytest
 from extended_file import extended_json, write_extended
-from listener import Listener, ended, start_monitor, start_plant
-from ros_helpers import Processes
+from listener import ended, start_monitor, start_plant
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.cli.main import main
-from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
@@ -45,7 +39,7 @@ STATE = {Signal.VALVE_OPENING: 50.0, Signal.MAIN_STEAM_PRESSURE: 13.0,
 
 
 @pytest.fixture(scope='module')
-def lifted() -> Characteristic:
+def lifted():
     """The curve of some hours of the plant, and 12 MW."""
     monitor = Monitor(Settings({'refit_period': 3600.0, 'refit_segments': 0}))
     feed_rows(monitor, simulate(0.1, 7).table)
@@ -58,9 +52,7 @@ def lifted() -> Characteristic:
 # The files
 
 
-def test_a_reference_and_a_model_are_read_from_their_files(
-    lifted: Characteristic, tmp_path: Path
-) -> None:
+def test_a_reference_and_a_model_are_read_from_their_files(lifted, tmp_path):
     assert parameter_files.given_reference(Settings()) is None
     path = tmp_path / 'characteristic.json'
     path.write_text(json.dumps(to_json(lifted)), encoding='utf-8')
@@ -83,7 +75,7 @@ def test_a_reference_and_a_model_are_read_from_their_files(
     assert json.loads(kept) == extended_json(**HELD)
 
 
-def test_a_model_that_follows_a_covariate_needs_its_topic(tmp_path: Path) -> None:
+def test_a_model_that_follows_a_covariate_needs_its_topic(tmp_path):
     vacuum = {
         'name': 'vacuum', 'values': {'b': -1.2, 'a1': 0.0, 'a2': 0.0}, 'switches_s': [],
         'covariate': {
@@ -120,9 +112,7 @@ def test_a_model_that_follows_a_covariate_needs_its_topic(tmp_path: Path) -> Non
         ('reference_file', json.dumps(extended_json()), "'format' must be"),
     ],
 )
-def test_a_file_of_another_kind_is_refused_with_a_sentence(
-    tmp_path: Path, parameter: str, text: str, said: str
-) -> None:
+def test_a_file_of_another_kind_is_refused_with_a_sentence(tmp_path, parameter, text, said):
     path = tmp_path / 'given.json'
     path.write_text(text, encoding='utf-8')
     of_model = parameter == 'model_file'
@@ -135,9 +125,7 @@ def test_a_file_of_another_kind_is_refused_with_a_sentence(
 @pytest.mark.ros
 @pytest.mark.usefixtures('ros_environment', 'here')
 @pytest.mark.parametrize('parameter', ['model_file', 'reference_file'])
-def test_a_bad_file_keeps_the_node_from_starting(
-    capfd: pytest.CaptureFixture[str], tmp_path: Path, parameter: str
-) -> None:
+def test_a_bad_file_keeps_the_node_from_starting(capfd, tmp_path, parameter):
     words = ['--ros-args', '-p', f'{parameter}:={tmp_path}/gone.json', '-p', 'record:=false']
     assert monitor_main.main(words) == 1
     said = capfd.readouterr().err
@@ -145,8 +133,8 @@ def test_a_bad_file_keeps_the_node_from_starting(
     assert 'Traceback' not in said
 
 
-def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
-    log: Any = SimpleNamespace(path=tmp_path, attachments={})
+def test_a_recording_without_its_model_is_not_verified(tmp_path):
+    log = SimpleNamespace(path=tmp_path, attachments={})
     settings = Settings({'model_file': 'gone.json'})
     with pytest.raises(RecordingError, match='lacks the attachment'):
         verifying.corrector_of_run(log, settings)
@@ -159,7 +147,7 @@ def test_a_recording_without_its_model_is_not_verified(tmp_path: Path) -> None:
 # The node
 
 
-def states(listener: Listener) -> list[int]:
+def states(listener):
     """Return how the alarm on a shift went."""
     return [a.state for a in listener.alarms if a.name == 'curve_shift' and a.occurrence]
 
@@ -167,8 +155,8 @@ def states(listener: Listener) -> list[int]:
 @pytest.mark.ros
 @pytest.mark.slow
 def test_curves_are_judged_their_alarm_is_put_aside_and_an_end_waits_for_no_refit(
-    processes: Processes, listener: Listener, lifted: Characteristic, tmp_path: Path
-) -> None:
+    processes, listener, lifted, tmp_path
+):
     given = tmp_path / 'reference.json'
     given.write_text(json.dumps(to_json(lifted)), encoding='utf-8')
     monitor = start_monitor(
@@ -240,12 +228,8 @@ WAITING = 'Messages that wait for the first /clock'
 @pytest.mark.ros
 @pytest.mark.slow
 def test_values_before_the_first_clock_are_corrected_and_recorded_before_its_time(
-    processes: Processes,
-    listener: Listener,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    processes, listener, tmp_path, capsys, monkeypatch
+):
     """None is lost, none stands at 1970, and the recording repeats with the model it holds."""
     model = write_extended(tmp_path / 'extended_model.json', **HELD)
     monitor = start_monitor(
@@ -259,10 +243,10 @@ def test_values_before_the_first_clock_are_corrected_and_recorded_before_its_tim
     everybody = [*publishers.values(), clock]
     listener.until(lambda: all(p.get_subscription_count() for p in everybody), 'the monitor')
 
-    def tick(k: int) -> None:
+    def tick(k):
         clock.publish(Clock(clock=to_time(DEFAULT_START_NS + k * NS_PER_S)))
 
-    def told(key: str) -> str:
+    def told(key):
         return listener.value('input valve_opening', key)
 
     for k in range(EARLY + LATE):

@@ -1,17 +1,13 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import itertools
 import json
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from rclpy.node import Node
-from ros_helpers import Processes, wait_until
+from ros_helpers import wait_until
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 from valveflow_msgs.msg import Alarm, PlantSample, Prediction
@@ -24,7 +20,7 @@ from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
 from valveflow_ros.ros.encoding import encode, float64_bytes
 from valveflow_ros.ros.node.intake import ClockTrack
-from valveflow_ros.ros.node.polled_subscription import PolledSubscription, RawMessage
+from valveflow_ros.ros.node.polled_subscription import PolledSubscription
 from valveflow_ros.ros.replay_main import steps_of
 from valveflow_ros.ros.simulator_main import (
     check_together,
@@ -42,24 +38,24 @@ TABLE = simulate(0.01, 3).table.part(0, 600)
 class Ears:
     """Hears all inputs and the clock."""
 
-    def __init__(self, context: Any, names: list[str]) -> None:
+    def __init__(self, context, names):
         self.node = Node('ears', context=context, namespace='plant')
-        kinds: dict[str, Any] = {name: INPUT_BY_NAME[name].message_type for name in names}
+        kinds = {name: INPUT_BY_NAME[name].message_type for name in names}
         self._subscriptions = {
             name: PolledSubscription(self.node, kind, name, reliable=True)
             for name, kind in [*kinds.items(), ('/clock', Clock)]
         }
-        self.heard: dict[str, list[RawMessage]] = {name: [] for name in self._subscriptions}
+        self.heard = {name: [] for name in self._subscriptions}
 
-    def take(self) -> None:
+    def take(self):
         for name, subscription in self._subscriptions.items():
             self.heard[name] += subscription.take()
 
-    def until(self, process: Any) -> None:
+    def until(self, process):
         """Listen until a process has ended and nothing more comes."""
         quiet = 0
 
-        def over() -> bool:
+        def over():
             nonlocal quiet
             before = sum(map(len, self.heard.values()))
             self.take()
@@ -69,14 +65,14 @@ class Ears:
 
         wait_until(over, 'the end of the replay')
 
-    def close(self) -> None:
+    def close(self):
         self.node.destroy_node()
 
 
 @pytest.mark.ros
 def test_a_log_is_heard_again_as_it_stands_with_its_times_on_the_clock(
-    context: Any, processes: Processes, tmp_path: Path
-) -> None:
+    context, processes, tmp_path
+):
     path = tmp_path / 'log.csv'
     write_table(TABLE, path)
     names = [info.topic for info in SIGNALS]
@@ -100,7 +96,7 @@ def test_a_log_is_heard_again_as_it_stands_with_its_times_on_the_clock(
     ears.close()
 
 
-def test_a_recording_and_a_table_of_the_same_samples_give_the_same_steps(tmp_path: Path) -> None:
+def test_a_recording_and_a_table_of_the_same_samples_give_the_same_steps(tmp_path):
     write_samples(TABLE, tmp_path / 'log.mcap')
     write_table(TABLE, tmp_path / 'log.csv')
     names, steps = steps_of(open_log(tmp_path / 'log.mcap'))
@@ -111,7 +107,7 @@ def test_a_recording_and_a_table_of_the_same_samples_give_the_same_steps(tmp_pat
     assert [time_ns for time_ns, _ in sorted_steps] == TABLE.time_ns.tolist()
 
 
-def with_a_hole(table: SampleTable) -> SampleTable:
+def with_a_hole(table):
     power = table.column(Signal.GENERATED_POWER).copy()
     power[10] = math.nan
     columns = {info.signal: table.column(info.signal) for info in SIGNALS}
@@ -119,7 +115,7 @@ def with_a_hole(table: SampleTable) -> SampleTable:
 
 
 @pytest.mark.parametrize('command', [False, True])
-def test_the_plant_says_the_same_plainly_and_stamped(command: bool) -> None:
+def test_the_plant_says_the_same_plainly_and_stamped(command):
     from rclpy.serialization import deserialize_message
 
     table = with_a_hole(TABLE)
@@ -141,7 +137,7 @@ def test_the_plant_says_the_same_plainly_and_stamped(command: bool) -> None:
             assert good == math.isfinite(value)
 
 
-def test_effects_come_one_by_one_or_together() -> None:
+def test_effects_come_one_by_one_or_together():
     texts = ['gain_step:g=0.01,t0_days=1', 'backlash']
     apart = effects_of(texts)
     assert [e.name for e in apart] == ['gain_step', 'backlash']
@@ -159,11 +155,11 @@ def test_effects_come_one_by_one_or_together() -> None:
         ('', 1.0, 1_800_000_000),
     ],
 )
-def test_the_first_samples_time(text: str, rate: float, expected: int) -> None:
+def test_the_first_samples_time(text, rate, expected):
     assert start_ns_of(text, rate, 1_800_000_000 * NS_PER_S + 7) == expected * NS_PER_S
 
 
-def test_plain_values_need_a_clock_unless_in_real_time() -> None:
+def test_plain_values_need_a_clock_unless_in_real_time():
     refused = []
     for given in itertools.product((0.0, 1.0, 60.0), (False, True), (False, True)):
         try:
@@ -175,8 +171,8 @@ def test_plain_values_need_a_clock_unless_in_real_time() -> None:
 
 @pytest.mark.parametrize('occurrence', [None, 1, 0])
 def test_a_recording_whose_beginning_is_of_an_earlier_version_is_not_compared(
-    tmp_path: Path, occurrence: int | None
-) -> None:
+    tmp_path, occurrence
+):
     """It told no alarm as normal at its beginning; byte for byte it can be nothing of today's."""
     names = {'prediction': '/m/prediction', 'alarms': '/m/alarms'}
     attachments = {

@@ -2,15 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A monitor that is killed goes on where it was: same curve, same alarms, one recording."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import pytest
 from listener import LATCHED, MONITOR, Listener, ended, start_monitor
-from ros_helpers import Processes
 from valveflow_msgs.msg import Alarm
 from valveflow_msgs.srv import OperateAlarm
 
@@ -31,20 +24,20 @@ FAULT, RAISED, PLAYED = 8640, 10_400, 10_500
 class Plant(Listener):
     """Publishes rows of a log and hears what the monitor says."""
 
-    def __init__(self, context: Any) -> None:
+    def __init__(self, context):
         super().__init__(context, 'plant')
         self._player = Player(self.node, [PLANT_SAMPLE], 0.0, False, lambda: False)
 
-    def listeners(self) -> set[bytes]:
+    def listeners(self):
         """Return who takes our samples; one that was killed stays among them for a while."""
         found = self.node.get_subscriptions_info_by_topic(PLANT_SAMPLE)
         return {bytes(each.endpoint_gid) for each in found}
 
-    def play(self, start: int, end: int) -> None:
+    def play(self, start, end):
         assert not self._player.wait_for_listeners(240.0)
         self._player.play(stamped_steps([LOG.part(start, end)], False, 'unit'))
 
-    def play_to_the_alarm(self) -> None:
+    def play_to_the_alarm(self):
         """Give the monitor time for a curve, and then a fault."""
         self.play(0, FAULT)
         self.until(lambda: self.curves and self.curves[-1].model_id, 'the curve')
@@ -54,7 +47,7 @@ class Plant(Listener):
         # What is still being computed or on its way is heard too.
         self.quiet(3.0)
 
-    def play_to(self, end: int, known: set[bytes]) -> None:
+    def play_to(self, end, known):
         """Go on once a monitor listens that is not among the known ones, and knows of us."""
         self.until(lambda: self.listeners() - known, 'the new listener')
         self.health.clear()
@@ -63,35 +56,35 @@ class Plant(Listener):
         self.play(RAISED, end)
         self.quiet(1.0)
 
-    def operate(self, name: str, action: str) -> tuple[bool, str]:
+    def operate(self, name, action):
         request = OperateAlarm.Request(name=name, action=action)
         answer = self.call(OperateAlarm, 'operate_alarm', request)
         return answer.success, answer.message
 
-    def standing(self) -> list[Alarm]:
+    def standing(self):
         """Come late; return the alarms that have occurred."""
-        late: list[Alarm] = []
+        late = []
         self.node.create_subscription(Alarm, f'{MONITOR}/alarms', late.append, LATCHED)
         return self.until(lambda: [a for a in late if a.occurrence], 'the standing alarm')
 
 
 @pytest.fixture
-def plant(context: Any) -> Iterator[Plant]:
+def plant(context):
     made = Plant(context)
     yield made
     made.close()
 
 
-def killed(monitor: Any) -> None:
+def killed(monitor):
     monitor.kill()
     monitor.wait()
 
 
 def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
-    processes: Processes, plant: Plant, tmp_path: Path
-) -> None:
+    processes, plant, tmp_path
+):
     # Nothing is written in its time: what is on disk is there because it was confirmed.
-    given: dict[str, object] = {'record_flush': 60.0, 'alarm_suppress_time': 86400.0}
+    given = {'record_flush': 60.0, 'alarm_suppress_time': 86400.0}
     first = start_monitor(processes, tmp_path, **given)
     plant.until(lambda: plant.curves, 'the first monitor')
     second = start_monitor(processes, tmp_path, **given)
@@ -146,11 +139,9 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     assert list(tmp_path.glob('valveflow_*')) == [folder]
 
 
-def with_other_parameters_it_goes_on_from_what_was_confirmed(
-    processes: Processes, plant: Plant, folder: Path
-) -> None:
+def with_other_parameters_it_goes_on_from_what_was_confirmed(processes, plant, folder):
     """Those of the alarms and of the segments may be other ones, and nothing is recorded."""
-    given: dict[str, object] = {
+    given = {
         'record': False, 'state_directory': str(folder / 'state_unit'), 'steady_min': 150.0,
         'alarm_floor': 2.0, 'alarm_suppress_time': 86400.0,
     }  # fmt: skip

@@ -2,19 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A monitor that runs: it tells of publishers that do not fit and answers every request."""
 
-from __future__ import annotations
-
 import time
-from pathlib import Path
-from typing import Any
 
 import pytest
-from listener import MONITOR, Listener, start_monitor
+from listener import MONITOR, start_monitor
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import Processes
 from std_msgs.msg import Float32, Float64
 from std_srvs.srv import Trigger
 
@@ -25,28 +19,26 @@ BURSTS, OF_EACH = 2, 17
 
 
 @pytest.mark.ros
-def test_a_monitor_names_bad_publishers_and_answers_every_request(
-    processes: Processes, listener: Listener, tmp_path: Path
-) -> None:
+def test_a_monitor_names_bad_publishers_and_answers_every_request(processes, listener, tmp_path):
     monitor = start_monitor(processes, tmp_path, record=False, diagnostics_period=0.5)
     publishers_that_do_not_fit_are_named(listener)
     each_request_of_a_burst_is_answered(listener)
     assert monitor.poll() is None, processes.output(monitor)
 
 
-def publishers_that_do_not_fit_are_named(listener: Listener) -> None:
+def publishers_that_do_not_fit_are_named(listener):
     """Weak quality of service is said within 1 s, another publisher or a wrong type within 2 s."""
 
-    def publisher(kind: type, topic: str, reliable: bool = True) -> Publisher:
+    def publisher(kind, topic, reliable=True):
         policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         profile = QoSProfile(depth=10, reliability=policy)
         return listener.node.create_publisher(kind, topic, profile)
 
-    def says(topic: str, level: Level, words: str) -> bool:
+    def says(topic, level, words):
         found = listener.status(f' input {topic}')
         return found is not None and found.level == bytes([level]) and words in found.message
 
-    def seconds_until(condition: Any, what: str) -> float:
+    def seconds_until(condition, what):
         begun_s = time.monotonic()
         listener.until(condition, what, 60.0)
         return time.monotonic() - begun_s
@@ -61,7 +53,7 @@ def publishers_that_do_not_fit_are_named(listener: Listener) -> None:
     first = publisher(Float64, '/main_steam_pressure')
     listener.until(lambda: first.get_subscription_count(), 'the match')
 
-    def sent_and(level: Level, words: str) -> bool:
+    def sent_and(level, words):
         first.publish(Float64(data=16.0))
         return says('main_steam_pressure', level, words)
 
@@ -81,10 +73,10 @@ def publishers_that_do_not_fit_are_named(listener: Listener) -> None:
     assert {what: s for what, s in took.items() if s > limits[what] + 1.0} == {}
 
 
-def each_request_of_a_burst_is_answered(listener: Listener) -> None:
+def each_request_of_a_burst_is_answered(listener):
     value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=7200.0)
     change = SetParameters.Request(parameters=[Parameter(name='alarm_shelve_time', value=value)])
-    asked: list[tuple[Any, str, Any]] = [
+    asked = [
         *((Trigger, name, Trigger.Request()) for name in SERVICES),
         (SetParameters, 'set_parameters', change),
         (GetParameters, 'get_parameters', GetParameters.Request(names=['unit_tag'])),

@@ -2,17 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nobody outside this host is listened to, nobody else may read, and no demand is overheard."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
 import subprocess
 import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rclpy.context import Context
@@ -49,9 +45,7 @@ rclpy.shutdown()
 
 
 @pytest.mark.parametrize('discovery_range', ['', 'SYSTEM_DEFAULT', 'LOCALHOST'])
-def test_with_the_profile_a_node_listens_to_this_host_alone(
-    ros_environment: dict[str, str], discovery_range: str
-) -> None:
+def test_with_the_profile_a_node_listens_to_this_host_alone(ros_environment, discovery_range):
     environment = {**ros_environment, 'PYTHONPATH': f'{os.environ["PYTHONPATH"]}:{HERE}'}
     if discovery_range:
         environment |= dict.fromkeys(PROFILES, str(PROFILE))
@@ -69,7 +63,7 @@ def test_with_the_profile_a_node_listens_to_this_host_alone(
         assert {address for address, _ in found} == {LOOPBACK}
 
 
-def test_the_profile_is_installed_and_closed() -> None:
+def test_the_profile_is_installed_and_closed():
     text = PROFILE.read_text()
     assert '<useBuiltinTransports>false</useBuiltinTransports>' in text
     assert 'is_default_profile="true"' in text
@@ -92,7 +86,7 @@ DEMANDS = [
     # What a middleware that has it says of an empty keystore is its own.
     (WITH_KEYS, ''),
 ]
-MAINS: list[tuple[str, Callable[[list[str]], int], list[str]]] = [
+MAINS = [
     ('monitor', monitor_main.main, []),
     ('plant_simulator', simulator_main.main, []),
     ('replay', replay_main.main, ['nothing.csv', '--wait', '0']),
@@ -102,12 +96,10 @@ REFUSED = [(MAINS[0], demand) for demand in DEMANDS] + [(main, DEMANDS[-1]) for 
 
 
 @pytest.fixture
-def demanded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ros_environment: dict[str, str]
-) -> Callable[[dict[str, str]], None]:
+def demanded(monkeypatch, tmp_path, ros_environment):
     del ros_environment
 
-    def demand(environment: dict[str, str]) -> None:
+    def demand(environment):
         (tmp_path / 'keys' / 'enclaves').mkdir(parents=True)
         for name in ('ENABLE', 'STRATEGY', 'KEYSTORE', 'ENCLAVE_OVERRIDE'):
             monkeypatch.delenv(f'ROS_SECURITY_{name}', raising=False)
@@ -119,9 +111,7 @@ def demanded(
 
 @pytest.mark.usefixtures('here')
 @pytest.mark.parametrize(('main', 'demand'), REFUSED)
-def test_no_start_where_security_is_demanded_and_cannot_be_had(
-    demanded: Any, capfd: pytest.CaptureFixture[str], main: Any, demand: Any
-) -> None:
+def test_no_start_where_security_is_demanded_and_cannot_be_had(demanded, capfd, main, demand):
     (name, run, arguments), (environment, words) = main, demand
     demanded(environment)
     assert run(arguments) == 1
@@ -134,7 +124,7 @@ def test_no_start_where_security_is_demanded_and_cannot_be_had(
     assert 'Traceback' not in said
 
 
-def test_a_middleware_without_security_is_called_by_its_name(demanded: Any) -> None:
+def test_a_middleware_without_security_is_called_by_its_name(demanded):
     demanded(WITH_KEYS)
     with pytest.raises(InsecureError) as refusal:
         check_security([])
@@ -148,11 +138,11 @@ def test_a_middleware_without_security_is_called_by_its_name(demanded: Any) -> N
 
 
 @pytest.fixture
-def contexts(monkeypatch: pytest.MonkeyPatch) -> list[Context]:
+def contexts(monkeypatch):
     """The contexts in which nodes are tried."""
-    made: list[Context] = []
+    made = []
 
-    def make() -> Context:
+    def make():
         made.append(Context())
         return made[-1]
 
@@ -161,9 +151,7 @@ def contexts(monkeypatch: pytest.MonkeyPatch) -> list[Context]:
 
 
 @pytest.mark.parametrize('value', ['', 'False', '0', 'no', 'off'])
-def test_who_demands_nothing_is_let_through(
-    demanded: Any, contexts: list[Context], value: str
-) -> None:
+def test_who_demands_nothing_is_let_through(demanded, contexts, value):
     demanded({ENABLE: value, STRATEGY: 'Permissive'})
     check_security([])
     check_security([], {})
@@ -171,8 +159,8 @@ def test_who_demands_nothing_is_let_through(
 
 
 def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
-    demanded: Any, contexts: list[Context], tmp_path: Path
-) -> None:
+    demanded, contexts, tmp_path
+):
     demanded({})
     wish = {**ENFORCED, KEYSTORE: str(tmp_path / 'keys')}
     # The stack itself sees no wish, so that its node stands for one that got what it wished for.
@@ -181,9 +169,7 @@ def test_a_node_that_can_be_made_is_let_through_and_leaves_nothing_behind(
     assert [context.ok() for context in contexts] == [False, False]
 
 
-def test_an_unknown_middleware_is_not_trusted_to_refuse(
-    demanded: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unknown_middleware_is_not_trusted_to_refuse(demanded, monkeypatch):
     demanded(WITH_KEYS)
     monkeypatch.setattr(domain, 'get_rmw_implementation_identifier', lambda: 'rmw_new_cpp')
     with pytest.raises(InsecureError, match='of rmw_new_cpp it is not known'):
@@ -193,7 +179,7 @@ def test_an_unknown_middleware_is_not_trusted_to_refuse(
 # Paths
 
 
-def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(tmp_path: Path) -> None:
+def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'round').symlink_to(tmp_path / 'round')
     (tmp_path / 'endless').symlink_to('/dev/zero')
@@ -217,14 +203,14 @@ def test_a_file_that_is_none_is_refused_in_a_sentence_at_once(tmp_path: Path) ->
         assert '\n' not in sentence
 
 
-def within(limit_s: float, work: Callable[[], object]) -> None:
+def within(limit_s, work):
     """Do work that must not wait for anybody; raises what it raises."""
     with ThreadPoolExecutor(1) as pool:
         pool.submit(work).result(limit_s)
 
 
 @pytest.mark.parametrize('text', ['a\0b', 'a\nb', 'a\x1b[2Jb', 'x' * 501, 'a\u202eb'])
-def test_a_path_is_one_printable_line(context: Any, text: str) -> None:
+def test_a_path_is_one_printable_line(context, text):
     names = [row.name for row in TABLE if row.name.endswith(('_directory', '_file', '_tag'))]
     for name in names:
         with pytest.raises(ParameterError, match='must be one line of at most 500 printable'):
@@ -239,9 +225,7 @@ def test_a_path_is_one_printable_line(context: Any, text: str) -> None:
     'given',
     ['{}/file', '{}/file/below', '/proc/nowhere', '/dev/null', '{}/' + 'x' * 300, '{}/round'],
 )
-def test_a_folder_that_cannot_be_made_is_a_sentence_and_the_run_goes_on(
-    tmp_path: Path, given: str
-) -> None:
+def test_a_folder_that_cannot_be_made_is_a_sentence_and_the_run_goes_on(tmp_path, given):
     (tmp_path / 'file').touch()
     (tmp_path / 'round').symlink_to(tmp_path / 'round')
     settings = Settings({'record_directory': given.format(tmp_path)})
@@ -259,7 +243,7 @@ def test_a_folder_that_cannot_be_made_is_a_sentence_and_the_run_goes_on(
 @pytest.mark.parametrize(
     'tag', ['../../x', '/etc', '..', '.', '~', 'a/b', 'x' * 500, '$(id)', '*', 'ä/ö', '-rf']
 )
-def test_a_tag_does_not_lead_out_of_the_folder(tmp_path: Path, tag: str) -> None:
+def test_a_tag_does_not_lead_out_of_the_folder(tmp_path, tag):
     home = tmp_path / 'home'
     made = new_folder(Settings({'record_directory': str(home), 'unit_tag': tag}), 1.7e9)
     assert made.parent == home
@@ -268,7 +252,7 @@ def test_a_tag_does_not_lead_out_of_the_folder(tmp_path: Path, tag: str) -> None
     assert stat.S_IMODE(made.stat().st_mode) == 0o700
 
 
-def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
+def test_a_planted_link_is_not_followed(tmp_path):
     home, elsewhere = tmp_path / 'home', tmp_path / 'elsewhere'
     settings = Settings({'record_directory': str(home)})
     expected = new_folder(settings, 1.7e9)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The saved state as bytes, and its folder: one owner, whole or not at all."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import io
@@ -15,10 +13,7 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +47,7 @@ values = st.recursive(
 )
 
 
-def same(one: Any, other: Any) -> bool:
+def same(one, other):
     """Tell whether two values are equal to the type of each number."""
     if isinstance(one, np.ndarray):
         fits = isinstance(other, np.ndarray) and one.dtype == other.dtype
@@ -66,9 +61,7 @@ def same(one: Any, other: Any) -> bool:
 
 @given(st.dictionaries(st.text(), values, max_size=5))
 @limits(max_examples=30)
-def test_every_state_comes_back_and_its_first_line_tells_its_checksum(
-    state: dict[str, Any],
-) -> None:
+def test_every_state_comes_back_and_its_first_line_tells_its_checksum(state):
     data = to_bytes(state)
     found = from_bytes(data)
     assert same(state, found)
@@ -78,25 +71,25 @@ def test_every_state_comes_back_and_its_first_line_tells_its_checksum(
     assert line == b'valveflow-state 2 ' + hashlib.sha256(content).hexdigest().encode()
 
 
-def signed(content: bytes, version: int = VERSION, name: bytes = FORMAT) -> bytes:
+def signed(content, version=VERSION, name=FORMAT):
     digest = hashlib.sha256(content).hexdigest().encode()
     return name + b' %d ' % version + digest + b'\n' + content
 
 
-def archived(**more: Any) -> bytes:
+def archived(**more):
     archive = io.BytesIO()
     np.savez(archive, **more)
     return archive.getvalue()
 
 
-def tree(value: Any) -> Any:
+def tree(value):
     return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
 
 
 class Trap:
     """Would be executed by whoever unpickles it."""
 
-    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+    def __reduce__(self):
         return os.mkdir, ('executed',)
 
 
@@ -125,16 +118,14 @@ TRAP = np.array([Trap()], dtype=object)
         (to_bytes({'$array': 5}), r'cannot be read \(KeyError\)'),
     ],
 )
-def test_what_is_no_state_is_a_sentence(
-    data: bytes, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_state_is_a_sentence(data, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError, match=sentence):
         from_bytes(data)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_single_cut_and_many_flips_are_noticed() -> None:
+def test_every_single_cut_and_many_flips_are_noticed():
     data = to_bytes({'a': [1, 2.5, None, 'text'], 'b': np.arange(5), 'c': {'d': np.eye(2)}})
     for end in range(len(data)):
         with pytest.raises(DataError):
@@ -146,7 +137,7 @@ def test_every_single_cut_and_many_flips_are_noticed() -> None:
             from_bytes(data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :])
 
 
-def test_numbers_of_numpy_and_tuples_come_back_as_plain_ones() -> None:
+def test_numbers_of_numpy_and_tuples_come_back_as_plain_ones():
     state = {'number': np.float64(1.5), 'true': np.bool_(True), 'tuple': (1, 2), 'nan': np.nan,
              'table': {'$array': 0, 'y': 1}}  # fmt: skip
     found = from_bytes(to_bytes(state))
@@ -155,7 +146,7 @@ def test_numbers_of_numpy_and_tuples_come_back_as_plain_ones() -> None:
 
 
 @pytest.mark.parametrize('given', [5, [1.0, 2.0], np.zeros(3), np.zeros(2, dtype=np.int64)])
-def test_what_does_not_fit_an_array_changes_nothing(given: Any) -> None:
+def test_what_does_not_fit_an_array_changes_nothing(given):
     arrays = {'first': np.ones(2), 'second': np.ones(2)}
     with pytest.raises(DataError, match="'second'"):
         put_back(arrays, {'first': np.zeros(2), 'second': given})
@@ -166,13 +157,13 @@ def test_what_does_not_fit_an_array_changes_nothing(given: Any) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[StateFolder]:
+def folder(tmp_path):
     made = StateFolder(tmp_path / 'state')
     yield made
     made.close()
 
 
-def test_of_two_states_that_do_not_fit_the_larger_one_is_kept_aside(folder: StateFolder) -> None:
+def test_of_two_states_that_do_not_fit_the_larger_one_is_kept_aside(folder):
     """In whatever order they came; a tie keeps the one that is there."""
     folder.set_aside()
     assert not folder.aside.exists()
@@ -185,7 +176,7 @@ def test_of_two_states_that_do_not_fit_the_larger_one_is_kept_aside(folder: Stat
     assert folder.read() == b''
 
 
-def test_taking_back_twice_changes_nothing(folder: StateFolder) -> None:
+def test_taking_back_twice_changes_nothing(folder):
     folder.write(b'mended')
     folder.aside.write_bytes(b'before')
     for _ in range(2):
@@ -199,9 +190,7 @@ def test_taking_back_twice_changes_nothing(folder: StateFolder) -> None:
 
 
 @pytest.mark.parametrize('mask', [0o000, 0o077])
-def test_all_that_is_kept_is_its_owners_by_names_of_earlier_runs(
-    tmp_path: Path, mask: int
-) -> None:
+def test_all_that_is_kept_is_its_owners_by_names_of_earlier_runs(tmp_path, mask):
     before = os.umask(mask)
     try:
         folder = StateFolder(tmp_path / 'deep' / 'state')
@@ -219,7 +208,7 @@ def test_all_that_is_kept_is_its_owners_by_names_of_earlier_runs(
     assert stat.S_IMODE(folder.folder.stat().st_mode) == 0o700
 
 
-def test_the_last_curves_stay_and_each_is_found_by_its_name(folder: StateFolder) -> None:
+def test_the_last_curves_stay_and_each_is_found_by_its_name(folder):
     curves = [replace(CURVE, notes=(f'number {k}',)).with_id() for k in range(9)]
     for k, curve in enumerate(curves, 1):
         folder.write_curve(curve)
@@ -231,9 +220,7 @@ def test_the_last_curves_stay_and_each_is_found_by_its_name(folder: StateFolder)
 
 
 @pytest.mark.parametrize('content', ['[' * 100_000, '', '{}', 'null', '\udcff', 'another'])
-def test_a_file_that_is_no_curve_or_another_one_is_one_sentence(
-    folder: StateFolder, content: str
-) -> None:
+def test_a_file_that_is_no_curve_or_another_one_is_one_sentence(folder, content):
     folder.write_curve(CURVE)
     path = folder.folder / 'curve_abc.json'
     if content == 'another':
@@ -244,7 +231,7 @@ def test_a_file_that_is_no_curve_or_another_one_is_one_sentence(
         folder.curve('abc')
 
 
-def test_a_lock_names_its_owner_and_being_refused_keeps_no_descriptor(tmp_path: Path) -> None:
+def test_a_lock_names_its_owner_and_being_refused_keeps_no_descriptor(tmp_path):
     lock = tmp_path / LOCK
     lock.write_text('1234567890123456789\nand a lot more of the one before\n')
     folder = StateFolder(tmp_path)
@@ -272,7 +259,7 @@ def test_a_lock_names_its_owner_and_being_refused_keeps_no_descriptor(tmp_path: 
     os.close(other)
 
 
-def test_nothing_is_locked_read_or_written_through_a_link(tmp_path: Path) -> None:
+def test_nothing_is_locked_read_or_written_through_a_link(tmp_path):
     victim, state = tmp_path / 'victim', tmp_path / 'state'
     victim.write_text('not ours')
     state.mkdir()
@@ -294,18 +281,14 @@ def test_nothing_is_locked_read_or_written_through_a_link(tmp_path: Path) -> Non
     folder.close()
 
 
-def test_a_file_that_is_too_large_is_not_even_read(
-    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_is_too_large_is_not_even_read(folder, monkeypatch):
     monkeypatch.setattr(state_store, '_MAX_BYTES', 3)
     folder.write(b'1234')
     with pytest.raises(RecordingError, match='too large to be a saved state'):
         folder.read()
 
 
-def test_a_folder_that_another_program_removes_is_an_altered_one_and_made_again(
-    folder: StateFolder,
-) -> None:
+def test_a_folder_that_another_program_removes_is_an_altered_one_and_made_again(folder):
     place = folder.folder
     folder.write(b'x')
     assert not folder.altered
@@ -346,7 +329,7 @@ for line in iter(sys.stdin.readline, ''):
 """
 
 
-def test_killed_at_any_moment_it_is_the_old_or_the_new_state(tmp_path: Path) -> None:
+def test_killed_at_any_moment_it_is_the_old_or_the_new_state(tmp_path):
     chance = np.random.default_rng(1)
     with subprocess.Popen(
         [sys.executable, '-c', _WRITES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

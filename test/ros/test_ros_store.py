@@ -2,18 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is kept between runs: saved in time, used only where it fits, and gone on from."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,12 +36,12 @@ from valveflow_ros.state import from_bytes
 CURVE = example_curve(Settings()).with_id()
 
 
-def settings(folder: Path, **more: object) -> Settings:
+def settings(folder, **more):
     return Settings({'record_directory': str(folder), **more})
 
 
 @contextmanager
-def store(folder: Path, **more: object) -> Iterator[StateStore]:
+def store(folder, **more):
     made = StateStore(settings(folder, **more))
     try:
         yield made
@@ -53,7 +49,7 @@ def store(folder: Path, **more: object) -> Iterator[StateStore]:
         made.close()
 
 
-def written(folder: Path, rows: int = 3, **more: object) -> Path:
+def written(folder, rows=3, **more):
     """Save a state with some numbers; return its file."""
     with store(folder, **more) as made:
         content = {'settings': dict(settings(folder, **more)), 'numbers': np.arange(1.0 * rows)}
@@ -61,12 +57,12 @@ def written(folder: Path, rows: int = 3, **more: object) -> Path:
     return folder / 'state_unit' / STATE
 
 
-def rows_of(made: StateStore) -> int:
+def rows_of(made):
     """Return how many numbers the saved state has, 0 without one."""
     return 0 if made.saved is None else len(made.saved['numbers'])
 
 
-def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path: Path) -> None:
+def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path):
     with store(tmp_path):
         with pytest.raises(RecordingError, match=rf'another monitor \(process {os.getpid()}\)'):
             StateStore(settings(tmp_path))
@@ -92,9 +88,7 @@ def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path: Path) -
         ({'alarm_limit': 3.0, 'refit_period': 60.0, 'record_keep': 5}, ''),
     ],
 )
-def test_a_state_of_other_parameters_is_used_unless_it_is_of_another_unit(
-    tmp_path: Path, more: dict[str, object], words: str
-) -> None:
+def test_a_state_of_other_parameters_is_used_unless_it_is_of_another_unit(tmp_path, more, words):
     written(tmp_path)
     with store(tmp_path, **more) as found:
         assert (found.saved is None) == bool(words)
@@ -103,7 +97,7 @@ def test_a_state_of_other_parameters_is_used_unless_it_is_of_another_unit(
         assert not found.lost
 
 
-def test_a_mistyped_unit_or_period_costs_no_state(tmp_path: Path) -> None:
+def test_a_mistyped_unit_or_period_costs_no_state(tmp_path):
     path = written(tmp_path)
     for _ in range(2):
         with store(tmp_path, valve_opening_unit='fraction') as found:
@@ -126,7 +120,7 @@ def test_a_mistyped_unit_or_period_costs_no_state(tmp_path: Path) -> None:
         assert rows_of(mended) == 3
 
 
-def test_a_state_of_a_version_with_other_parameters_is_used(tmp_path: Path) -> None:
+def test_a_state_of_a_version_with_other_parameters_is_used(tmp_path):
     then = {
         **settings(tmp_path), 'no_longer_there': 3.0, 'alarm_floor': 1e9, 'refit_period': 'daily',
         'alarm_off_delay': 300.0,
@@ -141,7 +135,7 @@ def test_a_state_of_a_version_with_other_parameters_is_used(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize('how', ['cut', 'flipped', 'empty', 'newer', 'folder', 'pipe'])
-def test_a_state_that_is_not_whole_is_told_until_the_next_start(tmp_path: Path, how: str) -> None:
+def test_a_state_that_is_not_whole_is_told_until_the_next_start(tmp_path, how):
     path = written(tmp_path)
     data = path.read_bytes()
     path.unlink()
@@ -168,7 +162,7 @@ def test_a_state_that_is_not_whole_is_told_until_the_next_start(tmp_path: Path, 
 
 
 @pytest.mark.parametrize('given', ['', '/proc/nothing', '~nobody_of_that_name/x'])
-def test_where_nothing_can_be_saved_the_monitor_goes_on_and_says_so(given: str) -> None:
+def test_where_nothing_can_be_saved_the_monitor_goes_on_and_says_so(given):
     made = StateStore(Settings({'state_directory': given, 'record': False}))
     assert (made.on, made.saved_s, made.due) == (False, None, False)
     assert made.problem.startswith('The state cannot be saved. ') == bool(given)
@@ -179,7 +173,7 @@ def test_where_nothing_can_be_saved_the_monitor_goes_on_and_says_so(given: str) 
     made.close()
 
 
-def test_an_adopted_curve_is_saved_at_once_and_the_newest_state_last(tmp_path: Path) -> None:
+def test_an_adopted_curve_is_saved_at_once_and_the_newest_state_last(tmp_path):
     with store(tmp_path) as made:
         made.note([CurveAdopted(CURVE)])
         assert repr(made.curve(CURVE.model_id)) == repr(CURVE)
@@ -194,19 +188,19 @@ def test_an_adopted_curve_is_saved_at_once_and_the_newest_state_last(tmp_path: P
 
 
 def test_a_state_is_put_in_place_when_the_recording_is_ready_or_after_its_patience(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(state_store, '_PATIENCE_S', 60.0)
     path = tmp_path / 'state_unit' / STATE
 
-    def there() -> bytes:
+    def there():
         return path.read_bytes() if path.exists() else b''
 
     with store(tmp_path) as made:
         for answers in ([True], [False] * 3 + [True]):
             left, asked, before = list(answers), list[bytes](), there()
 
-            def ready(left: list[bool] = left, asked: list[bytes] = asked) -> bool:
+            def ready(left=left, asked=asked):
                 asked.append(there())
                 return left.pop(0)
 
@@ -226,12 +220,10 @@ def test_a_state_is_put_in_place_when_the_recording_is_ready_or_after_its_patien
         assert from_bytes(there()) == {'never': 'ready'}
 
 
-def test_what_cannot_be_written_is_a_problem_until_it_can(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_written_is_a_problem_until_it_can(tmp_path, monkeypatch):
     path = tmp_path / 'state_unit' / STATE
 
-    def failing(self: StateFolder, data: bytes) -> None:
+    def failing(self, data):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with store(tmp_path) as made:
@@ -251,12 +243,10 @@ def test_what_cannot_be_written_is_a_problem_until_it_can(
         assert from_bytes(path.read_bytes()) == {'fine': 1}
 
 
-def test_a_disk_that_does_not_answer_is_told_and_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_does_not_answer_is_told_and_not_waited_for(tmp_path, monkeypatch):
     answers, write = threading.Event(), StateFolder.write
 
-    def hanging(self: StateFolder, data: bytes) -> None:
+    def hanging(self, data):
         answers.wait(60.0)
         write(self, data)
 
@@ -279,13 +269,11 @@ def test_a_disk_that_does_not_answer_is_told_and_not_waited_for(
 
 
 @pytest.mark.parametrize('what', ['state', 'lock', 'everything', 'folder'])
-def test_what_another_program_removes_is_made_again_and_stays_taken(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_another_program_removes_is_made_again_and_stays_taken(what, tmp_path, monkeypatch):
     monkeypatch.setattr(state_store, '_WATCH_S', 0.0)
     state = {'settings': dict(settings(tmp_path)), 'numbers': np.arange(2.0)}
     folder = tmp_path / 'state_unit'
-    acts: dict[str, Callable[[], object]] = {
+    acts = {
         'state': (folder / STATE).unlink,
         'lock': (folder / LOCK).unlink,
         'everything': lambda: [path.unlink() for path in folder.iterdir()],
@@ -309,7 +297,7 @@ def test_what_another_program_removes_is_made_again_and_stays_taken(
         assert rows_of(found) == 2
 
 
-def test_who_lost_its_lock_to_another_monitor_says_so_and_writes_nothing(tmp_path: Path) -> None:
+def test_who_lost_its_lock_to_another_monitor_says_so_and_writes_nothing(tmp_path):
     with store(tmp_path) as first:
         (tmp_path / 'state_unit' / LOCK).unlink()
         with store(tmp_path) as second:
@@ -330,36 +318,34 @@ LOG_NS = 1_700_000_000_000_000_000
 # As `Session` records them: before the first row there is no time of the plant, and the message
 # bears the time of the log.
 BEFORE, AFTER = Output('characteristic', b'curve', 0), Output('breakpoints', b'knots', 5_000)
-WORKER: Any = SimpleNamespace(poll=list)
+WORKER = SimpleNamespace(poll=list)
 
 
 class Recorded:
     """What was recorded after the state was saved, with the definition of a topic."""
 
-    def __init__(self) -> None:
-        self.tail: list[LoggedMessage] = []
-        self.definitions: dict[str, str] = {}
+    def __init__(self):
+        self.tail = []
+        self.definitions = {}
 
-    def since(self, _folder: Path, _after: int, definitions: dict[str, str]) -> Any:
+    def since(self, _folder, _after, definitions):
         definitions.update(self.definitions)
         return self.tail
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorded:
+def recorded(monkeypatch):
     made = Recorded()
     monkeypatch.setattr(restart, 'recover_leftovers', lambda _: [])
     monkeypatch.setattr(restart, 'messages_since', made.since)
     return made
 
 
-def restarted(
-    saved: dict[str, Any], given: Settings, inputs: dict[str, str], make: Any = None
-) -> tuple[Restart, LiveEngine, list[tuple[Level, str]]]:
+def restarted(saved, given, inputs, make=None):
     """Return a restart from a saved state, its engine, and what was logged."""
     whole = {'settings': Settings(), 'log_ns': 1, 'recording': 'folder', 'began': {}, **saved}
-    kept: Any = SimpleNamespace(saved=whole, problem='', sentence='', curve=None)
-    logged: list[tuple[Level, str]] = []
+    kept = SimpleNamespace(saved=whole, problem='', sentence='', curve=None)
+    logged = []
     names = {name: topic for name, topic in whole.get('topics', {}).items() if name not in inputs}
     made = Restart(given, kept, inputs, names, lambda *line: logged.append(line))
     engine = made.engine(make or (lambda settings: LiveEngine(settings, WORKER)))
@@ -367,7 +353,7 @@ def restarted(
     return made, engine, logged
 
 
-def snapshot() -> dict[str, Any]:
+def snapshot():
     """Return the state of an engine with a reference."""
     engine = LiveEngine(Settings(), WORKER)
     engine.monitor.set_reference(CURVE)
@@ -378,19 +364,17 @@ def snapshot() -> dict[str, Any]:
     ('said', 'again'),
     [([], [BEFORE, AFTER]), ([BEFORE], [AFTER]), ([AFTER], [BEFORE]), ([AFTER, BEFORE], [])],
 )
-def test_each_output_stands_in_the_recording_once(
-    said: list[Output], again: list[Output], recorded: Recorded
-) -> None:
+def test_each_output_stands_in_the_recording_once(said, again, recorded):
     given = Settings()
     recorded.tail = [
         LoggedMessage(NAMES[o.name], 'some/msg/Type', LOG_NS, o.time_ns or LOG_NS, o.data)
         for o in said
     ]
-    engine: Any = SimpleNamespace(
+    engine = SimpleNamespace(
         monitor=Monitor(given), aligner=Aligner(given), restore=lambda _: None
     )
     of_tail = iter([[BEFORE, AFTER]])
-    outputs: Any = SimpleNamespace(of=lambda _: next(of_tail, []))
+    outputs = SimpleNamespace(of=lambda _: next(of_tail, []))
     saved = {'engine': None, 'topics': {**NAMES, 'journal': '/m/journal'}}
     ours, found, logged = restarted(saved, given, {}, lambda _: engine)
     assert found is engine
@@ -400,7 +384,7 @@ def test_each_output_stands_in_the_recording_once(
 
 
 @pytest.mark.usefixtures('recorded')
-def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it_kept() -> None:
+def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it_kept():
     told = (
         Level.OK,
         'Since the state was saved steady_min changed. Segments were found again in 0 rows. '
@@ -419,9 +403,7 @@ def test_a_run_with_other_parameters_goes_on_in_a_new_recording_and_says_what_it
 
 
 @pytest.mark.parametrize('earlier', [False, True])
-def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(
-    recorded: Recorded, earlier: bool
-) -> None:
+def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(recorded, earlier):
     text = Definitions().text('valveflow_msgs/msg/PlantSample')
     if earlier:  # before there was a code for unknown
         text = text.replace('QUALITY_GOOD=1', 'QUALITY_GOOD=0')
@@ -445,7 +427,7 @@ def test_the_tail_of_an_earlier_run_is_read_by_the_codes_it_was_recorded_with(
 
 
 @pytest.mark.parametrize('how', ['absent', 'other'])
-def test_a_state_of_another_version_is_used_where_it_fits_and_the_rest_is_told(how: str) -> None:
+def test_a_state_of_another_version_is_used_where_it_fits_and_the_rest_is_told(how):
     engine = snapshot()
     engine['monitor']['diagnosing'] = {'another': 'version'}
     if how == 'absent':

@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The terminal view over ROS: it finds the monitor and shows what it says."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -35,7 +32,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 class Speaker(Node):
     """Says what a monitor says, once for each that asks."""
 
-    def __init__(self, context, name: str = 'valveflow_monitor') -> None:
+    def __init__(self, context, name='valveflow_monitor'):
         super().__init__(name, context=context)
         self.head = Header(stamp=Time(sec=AT_S), frame_id='U1')
         self.health = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -59,13 +56,13 @@ class Speaker(Node):
         publisher.publish(message)
         return publisher
 
-    def say_health(self) -> None:
+    def say_health(self):
         self.health.publish(diagnostics_message(
             [Item('input valve_opening', Level.STALE, 'silent for 9 s.'),
              Item('recorder', Level.OK, 'Recording.')], 'monitor', 'U1', AT_S * 10**9,
         ))  # fmt: skip
 
-    def go_on(self) -> None:
+    def go_on(self):
         """Say what comes again and again."""
         self.say_health()
         self.predictions.publish(
@@ -77,7 +74,7 @@ class Speaker(Node):
 
 
 @pytest.fixture
-def watch(context, monkeypatch) -> Iterator[WatchNode]:
+def watch(context, monkeypatch):
     usual = Node.__init__
 
     def here(self, name, **more):
@@ -91,7 +88,7 @@ def watch(context, monkeypatch) -> Iterator[WatchNode]:
 
 
 @pytest.fixture
-def executor(context) -> Iterator[SingleThreadedExecutor]:
+def executor(context):
     made = SingleThreadedExecutor(context=context)
     yield made
     made.shutdown()

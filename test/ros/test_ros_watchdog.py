@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What systemd is told: that the monitor is ready, alive, ending; and never while it is stuck."""
 
-from __future__ import annotations
-
 import configparser
 import contextlib
 import os
@@ -14,14 +12,13 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import hurt_monitor
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ros_helpers import Processes, wait_until
+from ros_helpers import wait_until
 
 from valveflow_ros.logs import RecorderState, RecorderStatus
 from valveflow_ros.ros.node.monitor_node import Watchdog, recorder_lives
@@ -35,28 +32,28 @@ PERIOD_S = 0.2
 class Supervisor:
     """Listens as systemd does, and notes when it heard what."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address):
         self.address = address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind('\0' + address[1:] if address.startswith('@') else address)
-        self.heard: list[tuple[float, str]] = []
+        self.heard = []
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
 
-    def _listen(self) -> None:
+    def _listen(self):
         while data := self._socket.recv(65536):
             self.heard.append((time.monotonic(), data.decode()))
 
-    def texts(self) -> list[str]:
+    def texts(self):
         return [text for _, text in self.heard]
 
-    def pings(self, since_s: float = 0.0) -> list[float]:
+    def pings(self, since_s=0.0):
         return [at_s for at_s, text in self.heard if 'WATCHDOG=1' in text and at_s >= since_s]
 
-    def environment(self, usec: int = 0) -> dict[str, str]:
+    def environment(self, usec=0):
         return {'NOTIFY_SOCKET': self.address, **({'WATCHDOG_USEC': str(usec)} if usec else {})}
 
-    def close(self) -> None:
+    def close(self):
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
             last.sendto(b'', self._socket.getsockname())
         self._thread.join(5.0)
@@ -64,7 +61,7 @@ class Supervisor:
 
 
 @contextlib.contextmanager
-def listening(abstract: bool = False) -> Iterator[Supervisor]:
+def listening(abstract=False):
     # A socket's path may be 107 bytes long, which pytest's folders are not made for.
     folder = tempfile.mkdtemp(prefix='vf')
     made = Supervisor(f'@{folder}/s' if abstract else f'{folder}/s')
@@ -76,18 +73,18 @@ def listening(abstract: bool = False) -> Iterator[Supervisor]:
 
 
 @pytest.fixture
-def supervisor() -> Iterator[Supervisor]:
+def supervisor():
     with listening() as made:
         yield made
 
 
-def last(supervisor: Supervisor, count: int) -> list[str]:
+def last(supervisor, count):
     wait_until(lambda: len(supervisor.heard) >= count, f'{count} datagrams', 10.0)
     return supervisor.texts()
 
 
 @pytest.mark.parametrize('abstract', [False, True])
-def test_ready_status_and_end_reach_the_manager(abstract: bool) -> None:
+def test_ready_status_and_end_reach_the_manager(abstract):
     with listening(abstract) as supervisor:
         watchdog = Watchdog(supervisor.environment(usec=10_000_000))
         watchdog.status('Loading.')
@@ -100,7 +97,7 @@ def test_ready_status_and_end_reach_the_manager(abstract: bool) -> None:
         ]
 
 
-def test_pings_come_at_twice_the_rate_asked_for_and_no_faster(supervisor: Supervisor) -> None:
+def test_pings_come_at_twice_the_rate_asked_for_and_no_faster(supervisor):
     # 20 s, a tenth each.
     now_s = iter(0.1 * k for k in range(1000, 1200))
     watchdog = Watchdog(supervisor.environment(usec=10_000_000), lambda: next(now_s))
@@ -121,9 +118,7 @@ def test_pings_come_at_twice_the_rate_asked_for_and_no_faster(supervisor: Superv
         {'WATCHDOG_USEC': '1000000', 'WATCHDOG_PID': '1'},
     ],
 )
-def test_no_ping_where_none_is_asked_of_this_process(
-    supervisor: Supervisor, environment: dict[str, str]
-) -> None:
+def test_no_ping_where_none_is_asked_of_this_process(supervisor, environment):
     watchdog = Watchdog({**supervisor.environment(), **environment})
     watchdog.completed(lambda: pytest.fail('the recorder was asked for nothing'))
     with watchdog.patient(600.0):
@@ -133,7 +128,7 @@ def test_no_ping_where_none_is_asked_of_this_process(
 
 
 @pytest.mark.parametrize('address', ['', 'relative/socket', '@', '/nowhere/socket', 'vsock:2:1'])
-def test_silent_and_unharmed_where_nobody_listens(address: str) -> None:
+def test_silent_and_unharmed_where_nobody_listens(address):
     watchdog = Watchdog({'NOTIFY_SOCKET': address, 'WATCHDOG_USEC': '1000000'})
     watchdog.ready('Listening.')
     watchdog.completed(lambda: WELL)
@@ -141,7 +136,7 @@ def test_silent_and_unharmed_where_nobody_listens(address: str) -> None:
     assert Watchdog({'WATCHDOG_USEC': '1000000'}).period_s == 0.0
 
 
-def test_a_manager_that_does_not_read_holds_nobody_up_and_gets_the_ping_later() -> None:
+def test_a_manager_that_does_not_read_holds_nobody_up_and_gets_the_ping_later():
     folder = tempfile.mkdtemp(prefix='vf')
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
         deaf.bind(f'{folder}/s')
@@ -168,10 +163,10 @@ def test_a_manager_that_does_not_read_holds_nobody_up_and_gets_the_ping_later() 
 
 
 @given(st.text())
-def test_no_text_becomes_another_assignment(text: str) -> None:
-    sent: list[str] = []
+def test_no_text_becomes_another_assignment(text):
+    sent = []
     watchdog = Watchdog({'NOTIFY_SOCKET': '@nobody'})
-    watchdog._send = lambda said: sent.append(said) or True  # type: ignore[assignment, func-returns-value]
+    watchdog._send = lambda said: sent.append(said) or True
     watchdog.ready(text)
     first, second, third = sent[0].splitlines()
     assert (first, third) == ('READY=1', 'WATCHDOG=1')
@@ -179,7 +174,7 @@ def test_no_text_becomes_another_assignment(text: str) -> None:
     assert second[7:].split() == text.split()
 
 
-def test_long_work_gets_its_time_and_then_the_old_limit_holds(supervisor: Supervisor) -> None:
+def test_long_work_gets_its_time_and_then_the_old_limit_holds(supervisor):
     watchdog = Watchdog(supervisor.environment(usec=10_000_000))
     with pytest.raises(ZeroDivisionError), watchdog.patient(600.0):
         raise ZeroDivisionError
@@ -201,9 +196,7 @@ def test_long_work_gets_its_time_and_then_the_old_limit_holds(supervisor: Superv
         (RecorderStatus(RecorderState.STOPPED, 'the recorder failed'), False),
     ],
 )
-def test_who_counts_as_alive(
-    status: RecorderStatus | None, lives: bool, supervisor: Supervisor
-) -> None:
+def test_who_counts_as_alive(status, lives, supervisor):
     assert recorder_lives(status, 1.0) is lives
     watchdog = Watchdog(supervisor.environment(usec=10_000_000))
     watchdog.completed(lambda: status)
@@ -213,9 +206,7 @@ def test_who_counts_as_alive(
 
 
 @pytest.mark.ros
-def test_a_monitor_that_is_held_up_anywhere_pings_no_more(
-    processes: Processes, supervisor: Supervisor, tmp_path: Path
-) -> None:
+def test_a_monitor_that_is_held_up_anywhere_pings_no_more(processes, supervisor, tmp_path):
     monitor = processes.start(
         'hurt_monitor', '--ros-args', '-p', f'record_directory:={tmp_path / "rec"}',
         '-p', 'diagnostics_period:=0.1', '-p', 'record_flush:=0.05',
@@ -223,11 +214,11 @@ def test_a_monitor_that_is_held_up_anywhere_pings_no_more(
         PYTHONPATH=f'{HERE}{os.pathsep}{os.environ.get("PYTHONPATH", "")}',
     )  # fmt: skip
 
-    def ready() -> bool:
+    def ready():
         assert monitor.poll() is None, processes.output(monitor)
         return any('READY=1' in text for text in supervisor.texts())
 
-    def goes_on() -> None:
+    def goes_on():
         """Require several pings from now on."""
         since_s = time.monotonic()
         wait_until(lambda: ready() and len(supervisor.pings(since_s)) >= 4, 'four pings', 60.0)
@@ -256,8 +247,8 @@ def test_a_monitor_that_is_held_up_anywhere_pings_no_more(
 # The unit
 
 
-def test_the_unit_believes_the_process_that_watches_and_is_closed() -> None:
-    unit: dict[str, list[str]] = {}
+def test_the_unit_believes_the_process_that_watches_and_is_closed():
+    unit = {}
     lines = (ROOT / 'config' / 'valveflow.service').read_text().replace('\\\n', ' ').splitlines()
     for line in lines:
         name, sign, value = line.partition('=')
@@ -289,7 +280,7 @@ def test_the_unit_believes_the_process_that_watches_and_is_closed() -> None:
     assert profiles | {'ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT'} <= set(unit['Environment'])
 
 
-def test_the_unit_is_as_closed_as_its_work_allows() -> None:
+def test_the_unit_is_as_closed_as_its_work_allows():
     tool = shutil.which('systemd-analyze')
     if tool is None:
         pytest.skip('no systemd-analyze here')

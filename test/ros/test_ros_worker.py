@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits in a child process: each task has one outcome, whatever becomes of the process."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal
@@ -11,11 +9,9 @@ import subprocess
 import sys
 import time
 import weakref
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import hurt_jobs
 import psutil
@@ -50,7 +46,7 @@ DIAGNOSIS = DiagnosisTask(5, TASK.contents, Settings(), example_curve(Settings()
 
 
 @contextmanager
-def worker(job: str, timeout_s: float = 120.0, **more: Any) -> Iterator[FitWorker]:
+def worker(job, timeout_s=120.0, **more):
     made = FitWorker(timeout_s, job if ':' in job else f'hurt_jobs:{job}', **more)
     made.start()
     try:
@@ -60,14 +56,14 @@ def worker(job: str, timeout_s: float = 120.0, **more: Any) -> Iterator[FitWorke
 
 
 class Clock:
-    def __init__(self) -> None:
+    def __init__(self):
         self.now_s = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now_s
 
 
-def answered(made: Any, task: Any = TASK) -> Any:
+def answered(made, task=TASK):
     """Return the result of a task, or of the one that was submitted already."""
     if task is not None:
         made.submit(task)
@@ -77,7 +73,7 @@ def answered(made: Any, task: Any = TASK) -> Any:
     return outcome.result
 
 
-def test_one_process_gives_a_fit_bit_for_bit_and_sentences_for_bad_results() -> None:
+def test_one_process_gives_a_fit_bit_for_bit_and_sentences_for_bad_results():
     with worker(FIT_JOB) as made:
         # NaN is equal to itself here, and to the last bit.
         assert repr(answered(made)) == repr(fit(TASK))
@@ -95,7 +91,7 @@ def test_one_process_gives_a_fit_bit_for_bit_and_sentences_for_bad_results() -> 
 
 
 @pytest.mark.parametrize(('job', 'words'), hurt_jobs.BAD_DIAGNOSES.items(), ids=lambda x: '')
-def test_a_bad_diagnosis_is_a_sentence(job: Callable[[Any], Any], words: str) -> None:
+def test_a_bad_diagnosis_is_a_sentence(job, words):
     made = DiagnosisWorker(60.0)
     believed = made._believed(DIAGNOSIS, compute(job, DIAGNOSIS, 'diagnosis'))
     assert words in believed
@@ -105,7 +101,7 @@ def test_a_bad_diagnosis_is_a_sentence(job: Callable[[Any], Any], words: str) ->
 
 
 @pytest.mark.parametrize('job', ['diagnosed', 'hangs'])
-def test_each_diagnosis_has_a_process_of_its_own(job: str) -> None:
+def test_each_diagnosis_has_a_process_of_its_own(job):
     made = DiagnosisWorker(1.0 if job == 'hangs' else 60.0, f'hurt_jobs:{job}')
     assert made.poll() == []
     assert made.pid is None
@@ -117,7 +113,7 @@ def test_each_diagnosis_has_a_process_of_its_own(job: str) -> None:
         made.close()
 
 
-def test_a_killed_process_is_seen_at_once_and_replaced_and_nobody_waits_for_it() -> None:
+def test_a_killed_process_is_seen_at_once_and_replaced_and_nobody_waits_for_it():
     with worker('good') as made:
         assert isinstance(answered(made), Characteristic)
         killed(made)
@@ -128,7 +124,7 @@ def test_a_killed_process_is_seen_at_once_and_replaced_and_nobody_waits_for_it()
         assert (made.starts, made.failures_in_a_row) == (2, 0)
 
 
-def killed(made: FitWorker) -> None:
+def killed(made):
     """Kill the process of a worker and wait until its end can be seen."""
     process = made._process
     assert process is not None
@@ -136,7 +132,7 @@ def killed(made: FitWorker) -> None:
     wait_until(lambda: process.poll() is not None, 'the end of the process')
 
 
-def test_death_during_a_fit_is_its_outcome_and_the_pauses_grow() -> None:
+def test_death_during_a_fit_is_its_outcome_and_the_pauses_grow():
     clock = Clock()
     with worker('dies', clock=clock) as made:
         pauses = []
@@ -151,7 +147,7 @@ def test_death_during_a_fit_is_its_outcome_and_the_pauses_grow() -> None:
         assert pauses == pytest.approx([0.5, 1.0, 2.0], abs=0.03)
 
 
-def test_a_process_that_cannot_start_costs_no_busy_restarts() -> None:
+def test_a_process_that_cannot_start_costs_no_busy_restarts():
     clock = Clock()
     with worker('no_such_module:job', clock=clock) as made:
         for _ in range(2):
@@ -163,7 +159,7 @@ def test_a_process_that_cannot_start_costs_no_busy_restarts() -> None:
         assert made.starts == 3
 
 
-def test_a_newer_task_ends_an_older_one_and_a_hanging_one_is_ended() -> None:
+def test_a_newer_task_ends_an_older_one_and_a_hanging_one_is_ended():
     with worker('hangs', timeout_s=1.0) as made:
         made.submit(TASK)
         first = made.pid
@@ -178,7 +174,7 @@ def test_a_newer_task_ends_an_older_one_and_a_hanging_one_is_ended() -> None:
         assert not psutil.pid_exists(pid)
 
 
-def test_submitting_never_blocks_even_if_nobody_reads() -> None:
+def test_submitting_never_blocks_even_if_nobody_reads():
     with worker('good') as made:
         answered(made)
         assert made.pid is not None
@@ -206,7 +202,7 @@ time.sleep(600.0)
 """
 
 
-def test_the_process_ends_with_its_parent() -> None:
+def test_the_process_ends_with_its_parent():
     with subprocess.Popen([sys.executable, '-c', _PARENT], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
         child = psutil.Process(int(parent.stdout.readline()))
@@ -217,7 +213,7 @@ def test_the_process_ends_with_its_parent() -> None:
 
 
 @pytest.mark.parametrize('sent', [b'x' * 8, b'\xff' * 8])
-def test_a_process_that_writes_nonsense_costs_one_fit_and_is_replaced(sent: bytes) -> None:
+def test_a_process_that_writes_nonsense_costs_one_fit_and_is_replaced(sent):
     with worker('writes_nonsense') as made:
         task = replace(TASK, request_ns=int.from_bytes(sent, 'big') >> 1)
         assert answered(made, task) == 'The fit process gave an answer that cannot be read.'
@@ -226,7 +222,7 @@ def test_a_process_that_writes_nonsense_costs_one_fit_and_is_replaced(sent: byte
 
 
 @pytest.mark.parametrize('cut', [b'', b'valveflow-state', b'x' * 200, result_to_bytes(None)[:-1]])
-def test_damaged_bytes_are_refused(cut: bytes) -> None:
+def test_damaged_bytes_are_refused(cut):
     for read in (task_from_bytes, result_from_bytes):
         with pytest.raises(DataError):
             read(cut)
@@ -234,7 +230,7 @@ def test_damaged_bytes_are_refused(cut: bytes) -> None:
         result_from_bytes(to_bytes({'text': 'a diagnosis of no window'}))
 
 
-def test_tasks_and_results_arrive_as_they_were_sent() -> None:
+def test_tasks_and_results_arrive_as_they_were_sent():
     bare = {'contents': NO_ROWS, 'settings': TASK.settings}
     shaped = replace(TASK, form=StaticForm(OPENING, 1.05), known=StaticForm(OPENING, 1.05))
     for sent in (TASK, shaped, DIAGNOSIS):
@@ -249,7 +245,7 @@ def test_tasks_and_results_arrive_as_they_were_sent() -> None:
         assert repr(result_from_bytes(result_to_bytes(result))) == repr(result)
 
 
-def test_a_task_behind_a_warm_up_is_computed_by_the_same_process_in_its_own_time() -> None:
+def test_a_task_behind_a_warm_up_is_computed_by_the_same_process_in_its_own_time():
     clock = Clock()
     with worker('good', clock=clock) as made:
         first = made.pid
@@ -268,11 +264,11 @@ def test_a_task_behind_a_warm_up_is_computed_by_the_same_process_in_its_own_time
         assert (made.pid, made.starts, made.failures_in_a_row) == (first, 1, 0)
 
 
-def test_death_in_a_warm_up_is_no_outcome_and_the_process_is_replaced() -> None:
+def test_death_in_a_warm_up_is_no_outcome_and_the_process_is_replaced():
     with worker('dies') as made:
         made.warm_up(TASK)
 
-        def replaced() -> bool:
+        def replaced():
             assert made.poll() == []
             return made.starts == 2
 
@@ -281,7 +277,7 @@ def test_death_in_a_warm_up_is_no_outcome_and_the_process_is_replaced() -> None:
         assert (made.warming_up, made.failures_in_a_row) == (False, 1)
 
 
-def test_what_waits_behind_a_warm_up_is_not_ended_for_taking_long() -> None:
+def test_what_waits_behind_a_warm_up_is_not_ended_for_taking_long():
     """It may compile for minutes, once; but not for ever."""
     clock = Clock()
     with worker('hangs', clock=clock) as made:
@@ -296,11 +292,9 @@ def test_what_waits_behind_a_warm_up_is_not_ended_for_taking_long() -> None:
         assert not made.warming_up
 
 
-def test_memory_is_given_back_once_after_an_outcome_when_the_task_was_let_go(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_memory_is_given_back_once_after_an_outcome_when_the_task_was_let_go(monkeypatch):
     """A task holds days of rows; what is given back while they are held is not given back."""
-    held: list[bool] = []
+    held = []
     time_ns = TASK.contents.time_ns.copy()
     watched = weakref.ref(time_ns)
     task = replace(TASK, contents=replace(TASK.contents, time_ns=time_ns))
@@ -315,19 +309,17 @@ def test_memory_is_given_back_once_after_an_outcome_when_the_task_was_let_go(
     assert held == [False]
 
 
-def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(monkeypatch):
     worker_module.release_memory()
-    asked: list[int] = []
+    asked = []
     for library in (SimpleNamespace(malloc_trim=asked.append), SimpleNamespace()):
         monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _, found=library: found)
         worker_module.release_memory()
     assert asked == [0]
 
 
-def test_a_process_that_gets_no_descriptors_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> None:
+def test_a_process_that_gets_no_descriptors_is_an_outcome(monkeypatch):
+    def refuse():
         raise OSError(errno.EMFILE, 'Too many open files')
 
     monkeypatch.setattr(worker_module.multiprocessing, 'Pipe', refuse)
@@ -336,7 +328,7 @@ def test_a_process_that_gets_no_descriptors_is_an_outcome(monkeypatch: pytest.Mo
         assert 'could not be started (Too many open files)' in answered(made)
 
 
-def test_an_answer_that_comes_with_the_end_of_its_process_counts() -> None:
+def test_an_answer_that_comes_with_the_end_of_its_process_counts():
     with worker('hangs') as made:
         made.submit(TASK)
         killed(made)
