@@ -17,8 +17,9 @@ from valveflow_ros.cli.main import VERBS
 pytestmark = needs_jit
 
 
-# What the example itself does not say: a recording that grows is watched until Ctrl-C.
-MORE = {'watch': ['--once']}
+# What the example itself does not say: a recording that grows is watched until Ctrl-C; fewer days
+# show as well that its words are understood.
+MORE = {'watch': ['--once'], 'simulate': ['--days', '0.5']}
 
 
 # A file that must be there afterwards.
