@@ -5,7 +5,7 @@
 import pytest
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic
 
-from valveflow_ros.ros.demo import Story, moment, told_in_the_end
+from valveflow_ros.ros.demo import Story, minute, told_in_the_end
 from valveflow_ros.ros.encoding import header, to_time
 
 HOUR = 3600 * 10**9
@@ -89,7 +89,7 @@ def test_the_times_of_the_lines_never_go_back(capsys):
     story.on_diagnosis(diagnosis(FAULT + 3 * HOUR))
     begins, raised, late = lines(capsys)
     assert begins[:16] == '2023-11-16 12:00' < raised[:16] == late[:16]
-    assert late.endswith(f'(at {moment(FAULT + 3 * HOUR)})')
+    assert late.endswith(f'(at {minute(FAULT + 3 * HOUR)})')
 
 
 def test_what_is_nothing_to_tell_is_told_once_or_not(capsys):

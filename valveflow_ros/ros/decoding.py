@@ -18,7 +18,7 @@ from valveflow_msgs.msg import PlantSample
 from valveflow_ros.logs.names import qualities
 from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import N_SIGNALS, NS_PER_S, SIGNALS, Quality, Signal
+from valveflow_ros.records import N_SIGNALS, NS_PER_S, SIGNALS, Quality
 from valveflow_ros.signals.covariates import entries_of, parts
 from valveflow_ros.signals.units import Unit, unit_of
 
@@ -202,10 +202,3 @@ def with_todays_codes(data: bytes) -> bytes:
         name = f'{info.topic}_quality'
         setattr(sample, name, min(getattr(sample, name) + 1, PlantSample.QUALITY_BAD))
     return serialize_message(sample)
-
-
-def plausible_range(signal: Signal, settings: Settings) -> tuple[float, float]:
-    """Return the lowest and highest plausible value, in the engine's unit."""
-    opening = Signal.VALVE_OPENING
-    topic = SIGNALS[opening if signal == Signal.VALVE_COMMAND else signal].topic
-    return settings.real(f'{topic}_low'), settings.real(f'{topic}_high')

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -29,12 +28,12 @@ from valveflow_ros.plant.unit import UnitDescription
 from valveflow_ros.records import NS_PER_S
 from valveflow_ros.report.first_run import SENTENCE, is_first_run
 from valveflow_ros.report.terminal.text import number, whole
+from valveflow_ros.report.words import moment
 from valveflow_ros.ros.decoding import from_time
 from valveflow_ros.ros.domain import run, spinning
 from valveflow_ros.ros.listening import LATCHED
 from valveflow_ros.ros.process import Parser, StopFlag
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _HOUR_NS = 3600 * 10**9
 _FAULT, _FAULT_MW = 'curve_step', -12.0
 _FAULT_FROM = 0.5  # fraction of the run after which the fault begins
@@ -93,10 +92,9 @@ def tell(line: str) -> None:
     print(line, flush=True)
 
 
-def moment(time_ns: int) -> str:
-    """Return a time in the format of the monitor's sentences."""
-    at = _EPOCH + timedelta(microseconds=time_ns // 1000)
-    return at.strftime('%Y-%m-%d %H:%M')
+def minute(time_ns: int) -> str:
+    """Return a time as '2023-11-15 00:00', in UTC."""
+    return moment(time_ns)[:16]
 
 
 class Process:
@@ -228,7 +226,7 @@ class Story:
             return 'The fault raised no alarm.'
         hours = (told[0] - self._fault_ns) / _HOUR_NS
         more = '' if len(told) == 1 else f'; alarms in all: {len(told)}'
-        began = f'The fault began {moment(self._fault_ns)}'
+        began = f'The fault began {minute(self._fault_ns)}'
         return f'{began}; the first alarm came {hours:.1f} h later{more}.'
 
     def reached(self, time_ns: int) -> None:
@@ -245,9 +243,9 @@ class Story:
     def _tell(self, time_ns: int, words: str) -> None:
         """Print one line; the times of the lines never decrease."""
         if time_ns < self._last_told_ns:
-            words += f' (at {moment(time_ns)})'
+            words += f' (at {minute(time_ns)})'
         self._last_told_ns = max(time_ns, self._last_told_ns)
-        tell(f'{moment(self._last_told_ns)}  {words}')
+        tell(f'{minute(self._last_told_ns)}  {words}')
 
 
 class Watch(Node):
@@ -338,8 +336,8 @@ def _introduce(options: argparse.Namespace, fault_ns: int) -> None:
     starting = f'Starting the monitor. {SENTENCE}' if is_first_run() else 'Starting the monitor.'
     for line in (
         f"{counted(options.days, 'day')} of the paper's unit (seed {options.seed}), from "
-        f'{moment(DEFAULT_START_NS)} UTC on, {speed}.',
-        f'Hidden in it: from {moment(fault_ns)} on one of the valves gives up to '
+        f'{minute(DEFAULT_START_NS)} UTC on, {speed}.',
+        f'Hidden in it: from {minute(fault_ns)} on one of the valves gives up to '
         f'{-_FAULT_MW:g} MW less, whenever the load needs that valve. The monitor is not told.',
         'To watch from another terminal (after: source env.sh): '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]} valveflow watch',
@@ -467,7 +465,7 @@ def _compare(found: FlowCharacteristic) -> None:
     """Print the fitted curve next to the true curve of the simulated plant."""
     true = UnitDescription().curve
     tell(
-        f'The last curve before the fault (data until {moment(from_time(found.window_end))}), '
+        f'The last curve before the fault (data until {minute(from_time(found.window_end))}), '
         'and the truth, which only the simulated plant knows:'
     )
     head = '  piece   slope, 95 % [MW per % MPa^(9/8)]'

@@ -22,13 +22,13 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, SignalInfo
 from valveflow_ros.report.words import duration
-from valveflow_ros.ros.decoding import INPUT_BY_NAME, PLANT_SAMPLE, Row, plausible_range
+from valveflow_ros.ros.decoding import INPUT_BY_NAME, PLANT_SAMPLE, Row
 from valveflow_ros.ros.encoding import NOT_YET
 from valveflow_ros.ros.node.diagnostics import Item, Level
 from valveflow_ros.ros.node.intake import TopicStatistics
 from valveflow_ros.ros.node.recording import Recording, recorded_qos
 from valveflow_ros.ros.node.worker import DiagnosisWorker, FitWorker
-from valveflow_ros.signals.align import REASONS
+from valveflow_ros.signals.align import REASONS, plausible_ranges
 from valveflow_ros.signals.units import better_units, unit_of
 
 _NO_LEAD = -(2**63)
@@ -81,7 +81,7 @@ class InputHealth:
         self.mismatched: set[str] = set()
         self._topics = topics
         # Computed once, because these parameters cannot change at run time.
-        self._ranges = [plausible_range(info.signal, settings) for info in SIGNALS]
+        self._ranges = plausible_ranges(settings).tolist()
         self._jump_ns = round(settings.real('clock_jump') * NS_PER_S)
         self._by_host = by_host
         # Lists by signal number are fast; they are updated for every message.
@@ -286,7 +286,7 @@ class InputHealth:
             reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
             return f'In all runs so far: {", ".join(reasons)}.'
         name, value = found
-        low, high = plausible_range(info.signal, self.settings)
+        low, high = self._ranges[info.signal]
         stamped = name == PLANT_SAMPLE
         named = info.unit if stamped else self.settings.text(f'{info.topic}_unit')
         unit = unit_of(info.signal, named)
