@@ -169,6 +169,10 @@ def record_heads(raw):
     return [place for _, begin, _ in records(raw) for place in range(begin, begin + size)]
 
 
+def names_in(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
 def against_chunks(found, wanted, per_chunk):
     """Return how many whole chunks are missing, and what was found that is in no whole chunk."""
     left, missing = list(found), 0

@@ -20,6 +20,7 @@ from log_files import (
     STOCK,
     balanced,
     float64,
+    names_in,
     put,
     record,
     recorder_of,
@@ -310,8 +311,7 @@ def test_leftovers_are_finished_at_the_start(folder):
     recorder.add_topic('/unit1/valve_opening', FLOAT64)
     record(recorder, 0, 3, '/unit1/valve_opening')
     assert recorder.close().recovered[0].messages == len(wanted)
-    names = sorted(p.name for p in folder.iterdir())
-    assert names == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
+    assert names_in(folder) == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
     assert len(open_log(folder).readings) == len(wanted) + 3
 
 

@@ -22,6 +22,7 @@ from log_files import (
     STOCK,
     chunk_ends,
     float64,
+    names_in,
     read_back,
     records,
     stock,
@@ -95,10 +96,6 @@ def open_descriptors():
     # What earlier tests left to the collector may go at any moment.
     gc.collect()
     return len(os.listdir('/proc/self/fd'))
-
-
-def names_in(folder):
-    return sorted(p.name for p in folder.iterdir())
 
 
 def listed(folder):

@@ -19,6 +19,7 @@ from log_files import (
     START_NS,
     STOCK,
     float64,
+    names_in,
     plant_sample,
     read_back,
     records,
@@ -61,10 +62,6 @@ def by_mcap(path):
 
 def information(folder):
     return yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
-
-
-def names_in(folder):
-    return sorted(p.name for p in folder.iterdir())
 
 
 def modes_in(folder):

@@ -233,9 +233,6 @@ def test_an_act_that_applies_to_none_is_refused_in_words():
         assert monitor.operate_alarms(act, 'residual')[-1].text == 'residual'
 
 
-# --- an upset -------------------------------------------------------------------------------
-
-
 # --- days on end ----------------------------------------------------------------------------
 
 # As set by default, but for fits: few are enough to follow a plant that stays as it is.

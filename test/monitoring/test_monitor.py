@@ -341,6 +341,3 @@ def test_live_settings_may_change_and_leave_an_entry_others_may_not():
         with pytest.raises(ParameterError, match=name):
             monitor.reconfigure(monitor.settings.changed(changes))
     assert monitor.settings.real('sample_period') == 1.0
-
-
-# --- hostile --------------------------------------------------------------------------------
