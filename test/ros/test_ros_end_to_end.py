@@ -229,8 +229,7 @@ def a_changed_recording_is_noticed(log, folder):
         place = folder / field
         with RecordingWriter(place, attachments=log.attachments) as writer:
             for info in log.topics.values():
-                writer.add_topic(info.name, info.type, definition=info.definition,
-                                 type_hash=info.type_hash)  # fmt: skip
+                writer.add_topic(info.name, info.type, definition=info.definition)
             count = 0
             for message in log.iter_messages():
                 data = message.data

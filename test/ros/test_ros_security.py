@@ -266,7 +266,7 @@ def test_a_planted_link_is_not_followed(tmp_path):
     for name in (f'{made.name}_0.mcap.part', f'{made.name}_0.mcap', 'metadata.yaml'):
         (made / name).symlink_to(elsewhere / 'victim')
     recorder = Recorder(made, RecorderSettings(free_floor_bytes=0, retry_s=0.01))
-    recorder.add_topic('/a', 'std_msgs/msg/Float64', definition='float64 data')
+    recorder.add_topic('/a', 'std_msgs/msg/Float64')
     recorder.record('/a', bytes(12), AT_NS, AT_NS)
     recorder.close(10.0)
     assert [path.read_text() for path in elsewhere.iterdir()] == ['untouched']

@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from valveflow_ros.errors import InputError, RecordingError
-from valveflow_ros.logs.mcap.definitions import Definitions, full_name, parse_all
-from valveflow_ros.logs.mcap.definitions import type_hash as hash_of
+from valveflow_ros.logs.mcap.definitions import Definitions
 from valveflow_ros.logs.mcap.folder import is_split_of
-from valveflow_ros.logs.mcap.records import LayoutError
 from valveflow_ros.logs.mcap.recover import RecoveryReport, recover_leftovers
 from valveflow_ros.logs.mcap.writer import Message, OpenFile, Qos, RecordingWriter
 from valveflow_ros.logs.part_file import PART_SUFFIX, PartFile, make_folder
@@ -230,8 +228,6 @@ class NewTopic(NamedTuple):
     topic: str
     type_name: str
     qos: Sequence[Qos]
-    type_hash: str
-    definition: str
     latched: bool
 
 
@@ -307,8 +303,6 @@ class Recorder:
         type_name: str,
         *,
         qos: Sequence[Qos] = (Qos(),),
-        type_hash: str | None = None,
-        definition: str | None = None,
         latched: bool = False,
     ) -> None:
         """Add a topic before its first message; adding it again changes nothing.
@@ -319,8 +313,6 @@ class Recorder:
             Its full name and ``package/msg/Type``.
         qos : sequence of Qos
             QoS profile of each of its publishers.
-        type_hash, definition : str, optional
-            By default those of `Definitions`.
         latched : bool
             If True, its last message is repeated at the start of every later split.
 
@@ -336,14 +328,10 @@ class Recorder:
             if known != type_name:
                 raise InputError(f"Topic '{topic}' is recorded as {known}, not as {type_name}.")
             return
-        text = self._definitions.text(type_name) if definition is None else definition
-        if type_hash is None:
-            try:
-                type_hash = hash_of(full_name(type_name), parse_all(type_name, text))
-            except LayoutError as error:
-                raise RecordingError(f"message type '{type_name}'", str(error)) from None
+        # Read here, so that the caller hears of a problem; the thread then has it at hand.
+        self._definitions.text(type_name)
         self._topics[topic] = type_name
-        self._put(NewTopic(topic, type_name, qos, type_hash, text, latched))
+        self._put(NewTopic(topic, type_name, qos, latched))
 
     def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
         """Queue a message of raw CDR bytes; never waits for the disk.
@@ -501,12 +489,9 @@ class Recorder:
             self._counters.working()
             item = self._queue.popleft()
             if isinstance(item, NewTopic):
-                topic, type_name, qos, type_hash, definition, latched = item
-                writer.add_topic(
-                    topic, type_name, qos=qos, type_hash=type_hash, definition=definition
-                )
-                if latched:
-                    self._latching.add(topic)
+                writer.add_topic(item.topic, item.type_name, qos=item.qos)
+                if item.latched:
+                    self._latching.add(item.topic)
                 continue
             if item.topic in self._latching:
                 self._fresh[item.topic] = item

@@ -70,7 +70,6 @@ class TopicRegistry:
         topic: str,
         type_name: str,
         qos: Sequence[Qos] = (Qos(),),
-        hash_text: str | None = None,
         definition: str | None = None,
     ) -> None:
         """Add a topic; adding it again changes nothing.
@@ -93,13 +92,14 @@ class TopicRegistry:
             self.table.schemas[number] = Schema(
                 id=number, name=type_name, encoding=SchemaEncoding.ROS2, data=text.encode()
             )
-        if hash_text is None:
-            hash_text = self._hash(type_name, definition)
         offered = '\n'.join(profile.text() for profile in qos)
         number = self.ids[topic] = len(self.ids) + 1
         self.table.channels[number] = Channel(
             id=number, topic=topic, message_encoding=MessageEncoding.CDR,
-            metadata={'offered_qos_profiles': offered, 'topic_type_hash': hash_text},
+            metadata={
+                'offered_qos_profiles': offered,
+                'topic_type_hash': self._hash(type_name, definition),
+            },
             schema_id=self._schema_ids[type_name],
         )  # fmt: skip
         self._packed = b''
@@ -229,11 +229,10 @@ class RecordingWriter:
         type_name: str,
         *,
         qos: Sequence[Qos] = (Qos(),),
-        type_hash: str | None = None,
         definition: str | None = None,
     ) -> None:
         """Add a topic before its first message; see `TopicRegistry.add`."""
-        self._topics.add(topic, type_name, qos, type_hash, definition)
+        self._topics.add(topic, type_name, qos, definition)
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add a message of raw CDR bytes; every 64 KiB of messages are written as a chunk.
