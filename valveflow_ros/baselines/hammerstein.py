@@ -247,6 +247,7 @@ def tangents(
 OUTPUT_ERROR: FloatArray = np.empty(0)
 _NARROWEST = 0.004  # of the range of u: minimum width of a piece, as in the proposed method
 _DELAY_STEPS_S = (8.0, 4.0, 2.0, 1.0)
+_REFIT_STEPS = 4  # of a model whose delay was changed
 # Initial models: least squares on a grid.
 _GRID_T_S = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0)
 _GRID_DELAY_S = (0.0, 5.0, 15.0, 30.0)
@@ -288,15 +289,15 @@ def move(
 
 
 def search_delay(
-    samples: Samples, model: HammersteinModel, ar: FloatArray, best: float, steps: int = 4
+    samples: Samples, model: HammersteinModel, best: float
 ) -> tuple[HammersteinModel, float]:
-    """Change the delay by whole rows, with a refit, as long as the error decreases."""
+    """Change the delay by whole rows, with a refit, as long as the output error decreases."""
     rows = sorted({max(1, round(s / model.step_s)) for s in _DELAY_STEPS_S}, reverse=True)
     for size in rows:
         for sign in (1, -1):
             while model.delay + sign * size >= 0:
                 shifted = replace(model, delay=model.delay + sign * size)
-                trial, value = move(samples, shifted, ar, steps)
+                trial, value = move(samples, shifted, OUTPUT_ERROR, _REFIT_STEPS)
                 if not value < best * (1.0 - 1e-7):
                     break
                 model, best = trial, value
@@ -405,7 +406,7 @@ def _orders(samples: Samples, model: HammersteinModel) -> list[tuple[str, Hammer
     for n_b, n_f in ORDERS:
         model, best = move(samples, grown(model, n_b, n_f), OUTPUT_ERROR, 12)
         if not found:
-            model, _ = search_delay(samples, model, OUTPUT_ERROR, best)
+            model, _ = search_delay(samples, model, best)
         found += [('output error', model), ('autoregressive', _whitened(samples, model))]
     return found
 
@@ -432,5 +433,5 @@ def _on_all(samples: Samples, model: HammersteinModel, noise: str) -> Hammerstei
     knots[0], knots[-1] = min(knots[0], u.min()), max(knots[-1], u.max())
     model = replace(model, knots=knots, values=model.static(knots))
     model, best = move(samples, model, OUTPUT_ERROR, 12)
-    model, _ = search_delay(samples, model, OUTPUT_ERROR, best)
+    model, _ = search_delay(samples, model, best)
     return model if noise == 'output error' else _whitened(samples, model)

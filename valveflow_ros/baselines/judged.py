@@ -220,9 +220,9 @@ class Judgement:
         errors = (s.scores[name].mse_mw2 * len(s.rows) for s in chosen)
         return sum(errors) / total if total else float('nan')
 
-    def bias(self, name: str, kind: SegmentKind | None = None) -> PairedTest:
+    def bias(self, name: str) -> PairedTest:
         """Test the mean of measured minus predicted over segments, weighted by samples."""
-        return _weighted([(len(s.rows), s.scores[name].samples.mean) for s in self.kinds(kind)])
+        return _weighted([(len(s.rows), s.scores[name].samples.mean) for s in self.segments])
 
     def gain(self, name: str, other: str, kind: SegmentKind | None = None) -> PairedTest:
         """Test the squared error of ``other`` minus that of ``name``; positive favours ``name``.
