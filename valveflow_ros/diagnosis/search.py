@@ -241,7 +241,8 @@ def _without_bend(
     _, knots, _ = settle(task, _settled_anew(task, model) or model, rounds=2, steps=10)
     # Straight pieces are what a valve is expected to have: any number of them may be needed.
     gain = _advantage(*own, knots, 0.0) - PENALTY * _BEND_SIZE
-    if gain < NOT_TOLD_APART:
+    # A given model keeps its number of pieces: more of them would be a finding too.
+    if gain < NOT_TOLD_APART and not task.fixed_dynamics:
         return knots, 'breakpoints of the curve explain the data as well'
     if _rounds(own[1]) and found.other_bend is None:
         return knots, 'it lies at a breakpoint, as the rounded breakpoint of a healthy valve would'
