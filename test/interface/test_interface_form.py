@@ -215,3 +215,22 @@ def test_where_the_segments_are_too_few_to_try_a_form_it_is_said():
     with pytest.raises(DataError, match=r'numbers of p\^m F\(V\) \+ c'):
         vf.identify(short.log, parameters={'axis': OPENING})
     assert 'could not be tried' in vf.identify(short.log).page().to_html()
+
+
+@pytest.mark.long
+def test_an_exponent_that_was_fitted_to_the_log_is_never_a_cause_beside_others() -> None:
+    """What is hidden bends the exponent of the first fit; it is fitted again."""
+    found = vf.diagnose(vf.simulate(5.0, 5, ('clock:d_s=25',)).log).diagnosis
+    assert [c.name for c in found.causes] == ['clock']
+    estimate = found.causes[0].parameters['d_s']
+    assert estimate.low < 25.0 < estimate.high
+
+
+@pytest.mark.long
+def test_a_bend_since_a_model_was_found_is_named_with_its_place_and_size() -> None:
+    healthy = vf.identify(vf.simulate(5.0, 6).log).characteristic
+    bent = vf.simulate(5.0, 5, ('curve_shape:h_mw=3,u0=1425,width_u=150',)).log
+    (cause,) = vf.diagnose(bent, model=healthy).diagnosis.causes
+    assert cause.name == 'curve_shape'
+    assert cause.parameters['h_mw'].value == pytest.approx(3.0, rel=0.2)
+    assert cause.parameters['u0'].value == pytest.approx(1425.0, abs=30.0)
