@@ -55,7 +55,7 @@ def _kind_words(kind: str) -> str:
 
 
 _RECORDINGS = {
-    'minute_2001_2100': 'means over a minute', '1s_901_910': 'every second',
+    'minute_2001_2100': 'means over a minute', '1s_5001_5010': 'every second',
     'compressed_1101_1110': 'exceptions alone',
 }  # fmt: skip
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -22,8 +23,6 @@ from diagnosis_records import (
 from streams import needs_jit
 
 import valveflow_ros as vf
-from benchmarks.naming.records import Entry
-from benchmarks.naming.records import record as benchmark_record
 from valveflow_ros.diagnosis.diagnose import diagnose
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.unit import Noise, Programme
@@ -144,7 +143,6 @@ def test_every_shape_is_told(what):
         'diurnal:a=0.004',
         'rate_limit:r_percent_per_s=0.1',
         'saturation:max_percent=82',
-        'curve_shape:h_mw=3',
     ],
 )
 def test_every_family_is_told_from_the_others(effect):
@@ -152,31 +150,38 @@ def test_every_family_is_told_from_the_others(effect):
     assert names(found) == {effect.partition(':')[0]}
 
 
+def five_days(seed, effects=(), unit='paper', minutes=True):
+    """Return a plant as means over a minute, or as every second."""
+    frame = vf.simulate(5.0, seed, effects, unit=unit).to_dataframe()
+    return frame.set_index('time').resample('60s').mean().reset_index() if minutes else frame
+
+
+@cache
+def healthy(unit='paper', minutes=True):
+    return vf.identify(five_days(6, unit=unit, minutes=minutes)).characteristic
+
+
 @pytest.mark.long
-@pytest.mark.parametrize('h_mw', [-2.0, 2.0])
-@pytest.mark.parametrize('seed', [3, 8])
-def test_a_bump_is_not_called_a_dent(h_mw, seed):
-    found = diagnosed(f'curve_shape:h_mw={h_mw},u0=1425,width_u=150', seed=seed)
-    assert names(found) == {'curve_shape'}
-    height = found.causes[0].parameters['h_mw']
-    assert height.value * h_mw > 0.0 or height.low * height.high < 0.0
-    assert ('equally well' in found.causes[0].sentence) == (height.low * height.high < 0.0)
-
-
-def test_means_of_a_minute_tell_a_bump_from_a_dent_beside_it():
-    plant = vf.simulate(5.0, 12, ['curve_shape:h_mw=3,u0=1425,width_u=140'])
-    frame = plant.to_dataframe().set_index('time').resample('60s').mean().reset_index()
-    (cause,) = vf.diagnose(frame).diagnosis.causes
+def test_a_bend_since_a_model_was_found_is_named_with_its_place_and_size():
+    bent = five_days(5, ('curve_shape:h_mw=3,u0=1425,width_u=150',), minutes=False)
+    (cause,) = vf.diagnose(bent, model=healthy(minutes=False)).diagnosis.causes
+    assert cause.name == 'curve_shape'
     assert cause.parameters['h_mw'].value == pytest.approx(3.0, rel=0.3)
     assert cause.parameters['u0'].value == pytest.approx(1425.0, abs=30.0)
 
 
-@pytest.mark.long
-def test_a_bend_that_breakpoints_explain_as_well_is_no_cause():
-    entry = Entry(93022, 'paper', 'minute', 'outside', 'two steps')
-    found = vf.diagnose(benchmark_record(entry, 5.0)[0]).diagnosis
+@pytest.mark.parametrize('minutes', [True, pytest.param(False, marks=pytest.mark.long)])
+def test_a_curve_that_changed_has_no_bend_beside_the_change(minutes):
+    log = five_days(5, ('curve_shape:h_mw=-3,u0=1425,width_u=150',), minutes=minutes)
+    found = vf.diagnose(log, model=healthy(minutes=minutes)).diagnosis
+    assert names(found) == {'curve_change'}
+
+
+def test_without_an_earlier_model_a_bend_is_no_cause():
+    """Breakpoints of the same record follow it, so its place and sign would be guesses."""
+    found = vf.diagnose(five_days(5, ('curve_shape:h_mw=3,u0=1425,width_u=150',))).diagnosis
     assert 'curve_shape' not in names(found)
-    assert ('curve_shape', 'breakpoints of the curve explain the data as well') in found.rejected
+    assert 'without an earlier model' in dict(found.rejected)['curve_shape']
 
 
 @pytest.mark.parametrize(
@@ -213,18 +218,11 @@ def rough_model_of_the_unit():
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ('unit', 'days', 'effects'), [
-        ('integrated_input_fixed:number=1312', 8.0, []),  # a rounded breakpoint
-        ('sequence_fixed:number=82036', 5.0, ['input_step:g=0.0068984,t0_days=3.51947']),
-    ],
-)  # fmt: skip
-def test_the_shape_of_a_healthy_valve_is_no_bump(unit, days, effects):
-    number = int(unit.partition('=')[2])
-    plant = vf.simulate(days, number, effects, unit=unit, recording='minute')
-    covariates = {'vacuum': 'condenser_pressure_kpa'} if effects else {}
-    found = vf.diagnose(plant.to_dataframe(), covariates=covariates).diagnosis
+@pytest.mark.parametrize('unit', ['paper', 'integrated_input_fixed:number=1312'])
+def test_the_shape_of_a_healthy_valve_is_no_bump(unit):
+    found = vf.diagnose(five_days(7, unit=unit), model=healthy(unit)).diagnosis
     assert 'curve_shape' not in names(found)
+    assert 'without an earlier model' not in dict(found.rejected).get('curve_shape', '')
 
 
 def test_faults_of_the_record_are_named_and_masked():

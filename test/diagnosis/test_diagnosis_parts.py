@@ -25,7 +25,7 @@ from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
-from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, _is_bend, simplified
+from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -311,13 +311,6 @@ def test_a_record_of_minutes_is_refused():
     samples = table(0.4, 2, (), unit()).part(0, 600)
     with pytest.raises(TooFewSamplesError, match='longer record'):
         make_grids(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
-
-
-@pytest.mark.parametrize(('height', 'counts'), [(-0.05, False), (-0.2, True), (0.2, False)])
-def test_a_small_bend_of_the_other_sign_does_not_count(height: float, counts: bool) -> None:
-    bend = FittedCause(catalogue()['curve_shape'], (height, 1600.0, 100.0))
-    named = replace(bend, values=(1.0, 1500.0, 100.0))
-    assert _is_bend(Extended(rough_model(), (bend,)), named, turned=True) is counts
 
 
 @pytest.mark.parametrize(('doubted', 'weighed'), [

@@ -224,13 +224,3 @@ def test_an_exponent_that_was_fitted_to_the_log_is_never_a_cause_beside_others()
     assert [c.name for c in found.causes] == ['clock']
     estimate = found.causes[0].parameters['d_s']
     assert estimate.low < 25.0 < estimate.high
-
-
-@pytest.mark.long
-def test_a_bend_since_a_model_was_found_is_named_with_its_place_and_size() -> None:
-    healthy = vf.identify(vf.simulate(5.0, 6).log).characteristic
-    bent = vf.simulate(5.0, 5, ('curve_shape:h_mw=3,u0=1425,width_u=150',)).log
-    (cause,) = vf.diagnose(bent, model=healthy).diagnosis.causes
-    assert cause.name == 'curve_shape'
-    assert cause.parameters['h_mw'].value == pytest.approx(3.0, rel=0.2)
-    assert cause.parameters['u0'].value == pytest.approx(1425.0, abs=30.0)

@@ -13,8 +13,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Estimate, FittedCause, SentenceValues, told
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.causes.curve import either_bend_sentence
-from valveflow_ros.diagnosis.causes.since_model import Change, since_model
+from valveflow_ros.diagnosis.causes.since_model import CURVE, Change, since_model
 from valveflow_ros.diagnosis.evidence import (
     LARGEST_P,
     Certainty,
@@ -50,7 +49,6 @@ from valveflow_ros.diagnosis.search import (
     Progress,
     SearchResult,
     search,
-    settle_bend,
     simplified,
 )
 from valveflow_ros.diagnosis.slow import (
@@ -316,12 +314,11 @@ def diagnose(
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
     since = since_model(task, model) if given else ''
-    start = Extended(model if given else simplified(model))
+    start, earlier_curve = Extended(model if given else simplified(model)), given
     if isinstance(since, Change):
-        start = since.changed
-    found = search(task, start, progress, rough)
+        start, earlier_curve = since.changed, since.name != CURVE
+    found = search(task, start, progress, rough, earlier_curve=earlier_curve)
     progress(0.7, 'the sealed blocks')
-    settle_bend(found)
     confirm(found)
     _withdraw_small(found)
     found.model = _dated(found)
@@ -643,17 +640,11 @@ def _conclude(
     sentences = {
         a.name: a.sentence(grids.start_ns, estimates[a.name], place) for a in final.active
     }
-    other = _other_bend(task, final, found)
-    if other:
-        one = next(a.named() for a in final.active if a.name == 'curve_shape')
-        values = {name: e.value for name, e in other.items()}
-        sentences['curve_shape'] = either_bend_sentence(one, values, place)
-        estimates['curve_shape'] = _either(estimates['curve_shape'], other)
     causes = tuple(
         NamedCause(
             a.name, sentences[a.name], estimates[a.name], gain,
             a.cause.experiment, found.near.get(a.name, ()), a.extra,
-            '' if other and a.name == 'curve_shape' else _meaning(task, final, a),
+            _meaning(task, final, a),
         )
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip
@@ -726,28 +717,6 @@ def _beside_drift(k: dict[str, Estimate], share: float) -> dict[str, Estimate]:
         )
         for name, e in k.items()
     }
-
-
-def _other_bend(task: Task, final: Extended, found: SearchResult) -> dict[str, Estimate]:
-    """Return the bend of opposite sign, fitted to all blocks; empty if there is none to report."""
-    other = found.other_bend
-    if other is None or 'curve_shape' not in final.names:
-        return {}
-    for name in set(other.names) - set(final.names):
-        other = other.without(name)
-    other, _ = improve(task, other, _LAST_STEPS)
-    return Certainty(task, other).intervals()['curve_shape']
-
-
-def _either(one: dict[str, Estimate], other: dict[str, Estimate]) -> dict[str, Estimate]:
-    """Return the values of the first with intervals that cover both; NaN stays NaN."""
-    return {
-        name: replace(
-            e, low=float(np.minimum(e.low, other[name].low)),
-            high=float(np.maximum(e.high, other[name].high)),
-        )
-        for name, e in one.items()
-    }  # fmt: skip
 
 
 def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,19 +24,16 @@ from valveflow_ros.diagnosis.fitting import (
     settle,
 )
 from valveflow_ros.diagnosis.grids import Grids
-from valveflow_ros.diagnosis.kernels import bump
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.errors import TooFewSamplesError
-from valveflow_ros.fit.piece_selection import choose_pieces
-from valveflow_ros.fit.problem import Problem, Samples
+from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
-from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.records import FloatArray
 
 # The plain simulation: few distinct pieces.
 #
 # A curve found by prediction error has as many breakpoints as reduce the error. A shallow one is
-# not a valve point but part of a smooth shape, and would hide `curve_shape` inside the model.
+# not a valve point but part of a smooth shape.
 
 SHALLOW = 0.2  # change of slope relative to the larger one
 _JUMP = 1e-4  # of the range of the curve, whose unit depends on the form
@@ -65,50 +62,6 @@ def without_knot(model: RegionalModel, knot: int) -> RegionalModel:
         left=np.delete(model.left, knot),
         right=np.delete(model.right, knot - 1),
     )
-
-
-# Breakpoints of the plain curve that are not valve points but the middle of a bump.
-#
-# A curve found by prediction error may have a breakpoint in the middle of a bump, and
-# `curve_shape` would find nothing. Such a breakpoint bends in the opposite direction to both
-# neighbours. It is removed if a bump in its place explains the data equally well.
-
-_WIDTHS = (0.5, 0.8, 1.2)  # of the shorter piece next to the breakpoint
-_PLACES = (-0.15, 0.0, 0.15)
-
-
-def without_bumps(task: Task, plain: Extended) -> tuple[Task, Extended]:
-    """Return the plain model without breakpoints that a bump can replace, fitted again."""
-    for knot in _suspects(plain):
-        smaller = replace(plain, base=simplified(without_knot(plain.base, knot)))
-        if _as_good(task, plain, smaller, float(plain.base.knots[knot]), _width(plain, knot)):
-            task, smaller, _ = settle(task, smaller, rounds=1, steps=4)
-            return without_bumps(task, smaller)
-    return task, plain
-
-
-def _suspects(plain: Extended) -> list[int]:
-    """Return inner breakpoints that bend in the opposite direction to both neighbours."""
-    bend = np.sign(np.diff(plain.base.slopes()))
-    return [
-        k + 1 for k in range(1, len(bend) - 1) if bend[k] == -bend[k - 1] == -bend[k + 1] != 0.0
-    ]
-
-
-def _width(plain: Extended, knot: int) -> float:
-    knots = plain.base.knots
-    return float(min(knots[knot] - knots[knot - 1], knots[knot + 1] - knots[knot]))
-
-
-def _as_good(task: Task, plain: Extended, smaller: Extended, u: float, width: float) -> bool:
-    """Return True if a bump at ``u`` reduces the cost of the smaller model to the plain one."""
-    screening, cause = Screening(task, smaller), catalogue()['curve_shape']
-    gain = max(
-        screening.scaled_height(cause, (u + place * width, share * width)).gain
-        for share in _WIDTHS
-        for place in _PLACES
-    )
-    return screening.floor - 2.0 * screening.variance * gain <= task.cost(plain)
 
 
 # New identification of curve and regions after a strong cause.
@@ -176,157 +129,6 @@ def _with_knot(base: RegionalModel, u: float) -> RegionalModel:
     )
 
 
-# A bump, a dent next to it, or neither.
-#
-# With free breakpoints, a curve with a bump is nearly equal to one with other breakpoints and a
-# dent next to it, or with a bump in place of a breakpoint. So a named bend is compared with such
-# bends, and with breakpoints alone, each beside a newly identified curve.
-
-_BESIDE = (-1.2, -0.7, 0.7, 1.2)  # of its half width
-_SHARES = (0.5, 1.0)  # of the height and half width that replace a breakpoint
-_BEND_SIZE = 3  # parameters
-_BEND_TOLD = 10.0  # log-likelihood by which one bend must be better than another
-# Of the height of the named one: others are not tried or ignored.
-_LEAST_BEND, _LARGEST_BEND = 0.1, 4.0
-
-
-def settle_bend(found: SearchResult) -> None:
-    """Give `curve_shape` the best place and sign; withdraw it where breakpoints do as well.
-
-    ``found.other_bend`` becomes the model with the opposite sign if it fits nearly as well. Two
-    models are compared with the whitening of one; each parameter of the curve is penalised.
-    """
-    bend = _bend(found.model)
-    if bend is None:
-        return
-    task = found.task if found.rough is None else replace(found.task, grids=found.rough)
-    anew = [_settled_anew(task, m) for m in _other_bends(found.model, bend)]
-    alike, turned = (
-        [m for m in anew if m and _is_bend(m, bend, turned) and not _rounds(m)]
-        for turned in (False, True)
-    )
-    kept, own = found.model, settle(task, found.model, rounds=2, steps=10)[:2]
-    if alike:
-        best = settle(task, _best(task, kept, alike), rounds=2, steps=10)[:2]
-        better = _advantage(*best, own[1])
-        kept = best[1] if better > _BEND_TOLD else kept
-        own = best if better > 0.0 else own
-    if turned:
-        best = settle(task, _best(task, found.model, turned), rounds=2, steps=10)[:2]
-        better, worse = _advantage(*best, own[1]), _advantage(*own, best[1])
-        if _is_bend(best[1], bend, turned=True) and better > 0.0:
-            kept, found.other_bend = best[1], own[1] if better < _BEND_TOLD else None
-            own = best
-        elif _is_bend(best[1], bend, turned=True) and worse < _BEND_TOLD:
-            found.other_bend = best[1]
-    knots, why = _without_bend(task, own, found)
-    if why:
-        kept, found.other_bend = knots, None
-        found.evidence.pop('curve_shape', None)
-        found.near.pop('curve_shape', None)
-        found.reasons['curve_shape'] = why
-    elif _rounds(own[1]):
-        kept, found.other_bend = found.other_bend or kept, None
-    if kept is not found.model:
-        found.task, found.model, _ = settle(found.task, kept, rounds=1, steps=6)
-    if why:
-        found.plain, _ = improve(found.task, replace(found.plain, base=found.model.base), 4)
-
-
-def _without_bend(
-    task: Task, own: tuple[Task, Extended], found: SearchResult
-) -> tuple[Extended, str]:
-    """Return the model with breakpoints alone, and why it is preferred to the bend; or ''."""
-    model = _in_pieces(own[1])
-    _, knots, _ = settle(task, _settled_anew(task, model) or model, rounds=2, steps=10)
-    # Straight pieces are what a valve is expected to have: any number of them may be needed.
-    gain = _advantage(*own, knots, 0.0) - PENALTY * _BEND_SIZE
-    # A given model keeps its number of pieces: more of them would be a finding too.
-    if gain < NOT_TOLD_APART and not task.fixed_dynamics:
-        return knots, 'breakpoints of the curve explain the data as well'
-    if _rounds(own[1]) and found.other_bend is None:
-        return knots, 'it lies at a breakpoint, as the rounded breakpoint of a healthy valve would'
-    return knots, ''
-
-
-def _in_pieces(model: Extended) -> Extended:
-    """Return the model with straight pieces in place of `curve_shape`."""
-    bend = _bend(model)
-    assert bend is not None
-    h, centre, width = bend.values
-    base = model.base
-    for u in (centre - width, centre, centre + width):
-        if base.knots[0] < u < base.knots[-1] and u not in base.knots:
-            base = _with_knot(base, u)
-    raised = np.empty(len(base.knots))
-    bump(base.knots, centre, width, raised)
-    base = replace(base, left=base.left + h * raised[:-1], right=base.right + h * raised[1:])
-    return replace(model.without('curve_shape'), base=base)
-
-
-def _best(task: Task, model: Extended, tried: list[Extended]) -> Extended:
-    return min(tried, key=lambda other: _advantage(task, model, other))
-
-
-def _other_bends(model: Extended, bend: FittedCause) -> Iterator[Extended]:
-    """Yield the model, with an opposite bend next to its own, and with one at each breakpoint."""
-    h, centre, width = bend.values
-    yield model
-    for beside in _BESIDE:
-        yield model.having(replace(bend, values=(-h, centre + beside * width, width)))
-    base = model.base
-    for k in range(1, len(base.knots) - 1):
-        height = _height(base, k)
-        if _LEAST_BEND * abs(h) < abs(height) < _LARGEST_BEND * abs(h):
-            wide = 0.5 * float(base.knots[k + 1] - base.knots[k - 1])
-            for share in _SHARES:
-                values = share * height, float(base.knots[k]), share * wide
-                at_knot = replace(bend, values=values)
-                yield replace(model, base=without_knot(base, k)).having(at_knot)
-
-
-def _height(base: RegionalModel, knot: int) -> float:
-    """Return how far the curve at a breakpoint is above the line between its neighbours, in MW."""
-    (a, b, c), slopes = base.knots[knot - 1 : knot + 2], base.slopes()
-    return float((slopes[knot - 1] - slopes[knot]) * (b - a) * (c - b) / (c - a))
-
-
-def _advantage(task: Task, model: Extended, other: Extended, each: float = _EACH) -> float:
-    """Return the log-likelihood of a model minus that of another, with one whitening."""
-    e = task.innovations(task.residual(model))
-    variance = float(e @ e) / len(e) * colour(task, e)
-    gain = (task.cost(other) - task.cost(model)) / (2.0 * variance)
-    return gain + each * (other.base.size - model.base.size)
-
-
-def _settled_anew(task: Task, model: Extended) -> Extended | None:
-    """Return the model fitted again with newly chosen pieces, and the same regions."""
-    try:
-        if not task.fixed_dynamics:
-            rows = Problem(_seen_through(task, model).coarser())
-            base = choose_pieces(rows, model.base, fit_ar(*rows.answer(model.base)), _MOST).model
-            model = replace(model, base=simplified(base))
-        return settle(task, model, rounds=1, steps=6)[1]
-    except (TooFewSamplesError, np.linalg.LinAlgError):
-        return None
-
-
-def _bend(model: Extended) -> FittedCause | None:
-    return next((a for a in model.active if a.name == 'curve_shape'), None)
-
-
-def _is_bend(model: Extended, named: FittedCause, turned: bool) -> bool:
-    """Return True if the bend lies on the curve and has the sign of the named one, or not."""
-    bend = _bend(model)
-    if bend is None:
-        return False
-    h = named.values[0]
-    height, centre = bend.values[:2]
-    low, high = model.base.knots[0], model.base.knots[-1]
-    large = abs(height) > _LEAST_BEND * abs(h)
-    return bool((height * h < 0.0) == turned and large and low < centre < high)
-
-
 Progress = Callable[[float, str], None]
 
 MOST_CAUSES = 4
@@ -338,7 +140,6 @@ NOT_TOLD_APART = 10.0
 # Of the largest power. The breakpoints of real valves are rounded; fixed on units built from
 # physics with numbers 5001 to 5012.
 _LEAST_HEIGHT = 0.0025
-_AT_KNOT = 0.5  # of the half width: a bend nearer to a breakpoint rounds it
 KEPT_LEAST = 8.0
 STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
 _SHORT_STEPS_MW = (1.0, 0.4)
@@ -373,10 +174,6 @@ class SearchResult:
         Number of causes tried.
     rough : Grids, optional
         The record with longer model rows, for screening.
-    other_bend : Extended, optional
-        The model with the opposite sign, if `curve_shape` may be a bump or a dent.
-    with_knots : Extended, optional
-        The plain model before breakpoints that a bump could replace were removed.
     """
 
     task: Task
@@ -387,22 +184,22 @@ class SearchResult:
     reasons: dict[str, str] = field(default_factory=dict)
     tried: int = 0
     rough: Grids | None = None
-    other_bend: Extended | None = None
-    with_knots: Extended | None = None
 
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'
 
 
 def search(
-    task: Task, start: Extended, progress: Progress, rough: Grids | None = None
-) -> SearchResult:
-    """Fit the plain model, then add causes while one of them passes all tests."""
+    task: Task, start: Extended, progress: Progress, rough: Grids | None = None,
+    *, earlier_curve: bool,
+) -> SearchResult:  # fmt: skip
+    """Fit the plain model, then add causes while one of them passes all tests.
+
+    With ``earlier_curve`` the breakpoints of ``start`` were not found from this record.
+    """
     progress(0.05, 'simulation fitted to the record')
-    task, rich, _ = settle(task, start, rounds=2, steps=4)
-    task, plain = without_bumps(task, rich)
-    with_knots = None if plain is rich else rich
-    found = SearchResult(task, plain, plain, rough=rough, with_knots=with_knots)
+    task, plain, _ = settle(task, start, rounds=2, steps=4)
+    found = SearchResult(task, plain, plain, rough=rough)
     barred: set[str] = set()
     every = causes_for(task.grids)
     for name, cause in every.items():
@@ -418,6 +215,12 @@ def search(
                 'results of the fit, with no expected values to compare them with'
             )
             barred.add(name)
+    elif not earlier_curve:
+        found.reasons['curve_shape'] = (
+            'cannot be judged without an earlier model whose curve still holds: breakpoints that '
+            'are found from the same record follow a bend too'
+        )
+        barred.add('curve_shape')
     found.tried = len(every) - len(barred)
     for turn in range(MOST_CAUSES):
         progress(0.15 + 0.15 * turn, 'causes tried' if turn == 0 else 'further causes tried')
@@ -459,10 +262,6 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
             # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
             continue
-        if rival.added.name == 'curve_shape' and _as_knots(found, rival):
-            found.reasons['curve_shape'] = 'breakpoints of the curve explain the data better'
-            barred.add('curve_shape')
-            return True
         best = rival.score if best is None else best
         without = found.model
         evidence = weigh(found.task, without, rival.model, rival.added.size)
@@ -515,31 +314,6 @@ def _small(task: Task, rival: Rival) -> str:
     if abs(rival.added.values[0]) > least:
         return ''
     return f'a healthy valve differs from straight pieces by up to {least:.2g} MW, this by less'
-
-
-def _rounds(model: Extended) -> bool:
-    """Return True if the bend is at a breakpoint, as the rounded one of a healthy valve is."""
-    bend, base = _bend(model), model.base
-    assert bend is not None
-    height, centre, width = bend.values
-    turns = np.diff(base.slopes())[np.abs(base.knots[1:-1] - centre) < _AT_KNOT * width]
-    return bool(np.any(turns * height > 0.0))
-
-
-def _as_knots(found: SearchResult, rival: Rival) -> bool:
-    """Put the breakpoints back if they explain the data better than a bump; tell if they do."""
-    if found.with_knots is None:
-        return False
-    model, _ = improve(found.task, replace(found.model, base=found.with_knots.base), 4)
-    task, bump = found.task, rival.model
-    variance = task.cost(model) / float(task.rows.sum())
-    gain = 0.5 * (task.cost(bump) - task.cost(model)) / variance
-    more = model.base.size - bump.base.size - rival.added.size
-    if gain <= PENALTY * more:
-        return False
-    found.task, found.model, _ = settle(task, model, rounds=1, steps=3)
-    found.plain = found.with_knots
-    return True
 
 
 def _visible(found: SearchResult, rivals: list[Rival], barred: set[str]) -> list[Rival]:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -75,24 +75,10 @@ def _levels_under(base: RegionalModel, values: Values, scale: float) -> Regional
 
 def curve_shape_sentence(values: SentenceValues) -> str:
     """Return the sentence for the operator."""
-    bend = _bend(values, values.place)
-    return f'The curve has {bend} that straight pieces do not follow (overlap of valves).'
-
-
-def either_bend_sentence(
-    one: dict[str, float], other: dict[str, float], place: Callable[[float], str]
-) -> str:
-    """Return the sentence for a bend whose sign is uncertain."""
+    what = 'bump' if values['h_mw'] > 0.0 else 'dent'
     return (
-        'The curve has a bend that straight pieces do not follow (overlap of valves): '
-        f'{_bend(one, place)} and {_bend(other, place)} explain the record about equally well.'
-    )
-
-
-def _bend(values: dict[str, float], place: Callable[[float], str]) -> str:
-    return (
-        f'a {"bump" if values["h_mw"] > 0.0 else "dent"} of '
-        f'{abs(values["h_mw"]):.2g} MW at {place(values["u0"])}'
+        f'The curve has a {what} of {abs(values["h_mw"]):.2g} MW at {values.place(values["u0"])} '
+        'that straight pieces do not follow (overlap of valves).'
     )
 
 
