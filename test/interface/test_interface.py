@@ -23,10 +23,11 @@ from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
 from valveflow_ros.interface.monitor import MonitorResult
 from valveflow_ros.interface.observation import settings_for
-from valveflow_ros.logs import write_samples, write_table
+from valveflow_ros.logs import write_table
+from valveflow_ros.logs.mcap.importing import write_readings
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import align_all, feed_aligned
-from valveflow_ros.records import SIGNALS, SampleTable, Signal
+from valveflow_ros.records import SIGNALS, SampleTable, Signal, table_to_readings
 from valveflow_ros.report.words import moment, percent
 from valveflow_ros.signals.align import Aligner
 
@@ -545,7 +546,8 @@ def test_the_units_are_those_the_monitor_was_told_if_they_are_units(tmp_path):
     for k, (unit, expected) in enumerate(told.items()):
         parameters = [1] if unit == 'no parameters' else {'main_steam_pressure_unit': unit}
         path = tmp_path / f'{k}' / 'a.mcap'
-        write_samples(sent, path, attachments={'parameters.json': json.dumps(parameters).encode()})
+        attached = {'parameters.json': json.dumps(parameters).encode()}
+        write_readings([table_to_readings(sent)], list(Signal), path, attachments=attached)
         log = vf.open_log(path)
         assert log.units[Signal.MAIN_STEAM_PRESSURE] == expected
         mine = log.readings.value[log.readings.signal == Signal.MAIN_STEAM_PRESSURE]

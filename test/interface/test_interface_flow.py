@@ -42,8 +42,12 @@ def flow(frame, factor, unit='t/h'):
 def test_a_scaled_output_gives_the_scaled_curve(frame, usual, factor, unit):
     found = curve_of(flow(frame, factor, unit))
     assert found.output_unit == unit
-    assert found.breakpoints == pytest.approx(usual.breakpoints, rel=2e-3)
-    assert found.values() / factor == pytest.approx(usual.values(), rel=2e-3)
+    # Breakpoints agree within a part of their own error, the curves closer than that.
+    moved = np.abs(found.breakpoints - usual.breakpoints)[1:-1]
+    assert np.all(moved < 0.25 * np.diff(usual.breakpoint_intervals)[:, 0])
+    at = np.linspace(*usual.breakpoints[[0, -1]], 200)
+    scaled = np.interp(at, found.breakpoints, found.values() / factor)
+    assert scaled == pytest.approx(np.interp(at, usual.breakpoints, usual.values()), rel=2e-3)
     assert found.residuals.rmse_mw / factor == pytest.approx(usual.residuals.rmse_mw, rel=2e-3)
     assert found.residuals.width_mw / factor == pytest.approx(usual.residuals.width_mw, rel=1e-2)
     for mine, theirs in zip(found.dynamics, usual.dynamics, strict=True):
