@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnosis_records import EXPONENT, STEP_S, table, unit
+from diagnosis_records import EXPONENT, STEP_S, record, rough_model, table, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from valveflow_ros.diagnosis import from_window
+from valveflow_ros.diagnosis.cause import Estimate
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.from_window import diagnose_window, table_of
 from valveflow_ros.diagnosis.result import to_json
@@ -73,3 +76,23 @@ def test_the_window_is_diagnosed_as_the_record_is() -> None:
     assert found.window_end_ns == task.window_end_ns
     assert [c['name'] for c in content['causes']] == ['temperature']
     assert content == truth
+
+
+def test_an_exponent_that_the_causes_had_bent_is_fitted_again(monkeypatch) -> None:
+    """It was fitted to the same record without them, so it is no fault of the unit."""
+    asked, off = [], Estimate(0.05, 0.04, 0.06, '')
+
+    def found(record, model, progress):
+        asked.append((record.form.exponent, model))
+        names = ('clock', 'exponent') if len(asked) == 1 else ('clock',)
+        return SimpleNamespace(causes=[SimpleNamespace(name=n, parameters={'dm': off})
+                                       for n in names])  # fmt: skip
+
+    monkeypatch.setattr(from_window, 'diagnose', found)
+    whole = record(table(0.2, 2, (), unit()))
+    answer, used = from_window.diagnose_own(whole, rough_model())
+    assert [c.name for c in answer.causes] == ['clock']
+    assert [exponent for exponent, _ in asked] == [EXPONENT, EXPONENT + 0.05]
+    assert used.form.exponent == EXPONENT + 0.05
+    # The breakpoints of the second model are at the u of its own exponent.
+    assert asked[1][1].knots[-1] == pytest.approx(asked[0][1].knots[-1] * 16.0**0.05, rel=0.1)

@@ -36,13 +36,26 @@ def flow(frame, factor, unit='t/h'):
     return vf.open_log(scaled, columns={'generated_power': f'{POWER}:{unit}'})
 
 
+@pytest.fixture(scope='module')
+def small(frame):
+    return curve_of(flow(frame, 0.01, 'kg/s'))
+
+
+def test_two_units_of_one_output_give_one_curve(frame, small):
+    large = curve_of(flow(frame, 1e4, 'lb/h'))
+    assert large.breakpoints == pytest.approx(small.breakpoints, rel=1e-9)
+    assert large.values() == pytest.approx(1e6 * small.values(), rel=1e-9)
+    assert large.residuals.rmse_mw == pytest.approx(1e6 * small.residuals.rmse_mw, rel=1e-9)
+
+
 @pytest.mark.parametrize(('factor', 'unit'), [
-    (0.01, 'kg/s'), pytest.param(3.0, 't/h', marks=pytest.mark.long), (1e4, 'lb/h'),
+    (0.01, 'kg/s'), pytest.param(3.0, 't/h', marks=pytest.mark.long),
 ])  # fmt: skip
-def test_a_scaled_output_gives_the_scaled_curve(frame, usual, factor, unit):
-    found = curve_of(flow(frame, factor, unit))
+def test_a_scaled_output_gives_the_scaled_curve(frame, usual, small, factor, unit):
+    found = small if factor == 0.01 else curve_of(flow(frame, factor, unit))
     assert found.output_unit == unit
-    # Breakpoints agree within a part of their own error, the curves closer than that.
+    # The steps of the searches in MW are not scaled exactly (`output_size`), so breakpoints agree
+    # within a part of their own error, and the curves closer than that.
     moved = np.abs(found.breakpoints - usual.breakpoints)[1:-1]
     assert np.all(moved < 0.25 * np.diff(usual.breakpoint_intervals)[:, 0])
     at = np.linspace(*usual.breakpoints[[0, -1]], 200)

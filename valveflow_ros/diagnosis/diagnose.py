@@ -208,7 +208,7 @@ _AGREES = 0.1
 _ACTS = 0.05  # fraction of the largest change below which there is no effect
 
 
-def _quiet(_share: float, _what: str) -> None:
+def quiet(_share: float, _what: str) -> None:
     """Show no progress."""
 
 
@@ -288,7 +288,7 @@ class _Rest:
 
 
 def diagnose(
-    record: Record, model: RegionalModel, given: bool = False, progress: Progress = _quiet
+    record: Record, model: RegionalModel, given: bool = False, progress: Progress = quiet
 ) -> Diagnosis:
     """Find the errors of the simulation, name the cause, extend the model, measure the gain.
 
@@ -332,7 +332,7 @@ def diagnose(
 
 def diagnose_form(
     record: Record, model: RegionalModel, asked: Record, found_model: RegionalModel,
-    progress: Progress = _quiet,
+    progress: Progress = quiet,
 ) -> Diagnosis:  # fmt: skip
     """Diagnose a record whose static power has another form than the given model.
 

@@ -392,7 +392,7 @@ def by_segment(
 #
 # A first-order lag stands for the dynamics of the unit, so the errors of what shows in fast moves
 # are not those of noise alone. Of 15 profile intervals for a valve or a reheater, in the sets
-# 82001, 93001 and 94001 of `benchmarks.naming`, 9 held the true size; at twice their width all.
+# 82001, 93001 and 94001 of `benchmarks.naming`, 9 held the true size; at twice their width 14.
 
 
 _Z95 = 1.959963984540054

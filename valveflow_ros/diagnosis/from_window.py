@@ -13,10 +13,11 @@ from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Stage
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.diagnose import Record, diagnose
+from valveflow_ros.diagnosis.diagnose import Record, diagnose, quiet
 from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
-from valveflow_ros.diagnosis.result import to_json
+from valveflow_ros.diagnosis.result import Diagnosis, to_json
+from valveflow_ros.diagnosis.search import Progress
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import refine
@@ -131,6 +132,24 @@ def _changes_opening(model: ExtendedModel | None) -> bool:
     )
 
 
+def diagnose_own(
+    record: Record, model: RegionalModel, progress: Progress = quiet
+) -> tuple[Diagnosis, Record]:
+    """Diagnose a record with a model that was found from it; return also the record used.
+
+    The exponent of the pressure was fitted too, without the causes, which may have bent it. If
+    another one is found beside them, the diagnosis is repeated with that exponent.
+    """
+    found = diagnose(record, model, progress=progress)
+    further = [c.parameters['dm'].value for c in found.causes if c.name == 'exponent']
+    if not further:
+        return found, record
+    form = replace(record.form, exponent=record.form.exponent + further[0])
+    record = replace(record, form=form)
+    model = first_model(record.table, record.step_s, form, record.settle_s)
+    return diagnose(record, model, progress=progress), record
+
+
 # Computing u from a pressure and the pressure from u changes its last digits, which would hide
 # that the pressure was constant.
 _DECIMALS = 9
@@ -163,7 +182,7 @@ def diagnose_window(task: DiagnosisTask) -> DiagnosisContent:
         covariates=tuple(c for c in beside if c.name not in short),
     )  # fmt: skip
     record = without_causes(record, task.curve.held)
-    found = diagnose(record, model)
+    found, _ = diagnose_own(record, model)
     left_out = (f'{c.few} {c.name} was left out.' for c in short.values())
     found = replace(found, notes=(*found.notes, *left_out))
     text = json.dumps(to_json(found), allow_nan=False)

@@ -22,7 +22,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit.descent import descend
-from valveflow_ros.fit.problem import Problem, free_parameters, move
+from valveflow_ros.fit.problem import CLOSEST_KNOTS, Problem, free_parameters, move
 from valveflow_ros.fit.uncertainty import bend_certainty
 from valveflow_ros.fit.whitening import whitened
 from valveflow_ros.numerics import gram, product
@@ -369,7 +369,8 @@ def _search_place(
 
     def moved(model: RegionalModel, by: float) -> RegionalModel | None:
         trial = _moved(model, knot, by)
-        return None if np.any(np.diff(trial.knots) <= 0.004 * span) else trial
+        # Others may be as close as that already, but for rounding.
+        return None if np.diff(trial.knots).min() < 0.999 * CLOSEST_KNOTS * span else trial
 
     for share, sign in itertools.product(_STEPS, (1.0, -1.0)):
         model, cost = descend(

@@ -32,7 +32,7 @@ _FEW = 4
 _HELD_SHARE = 0.3
 # A shorter lag, as a fraction of the time between rows, does not show in them.
 LEAST_LAG, _LONGEST_LAG_S, _LONGEST_DELAY_S = 0.1, 3600.0, 600.0
-_CLOSEST_KNOTS = 0.004  # of their range
+CLOSEST_KNOTS = 0.004  # of their range
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 
@@ -294,9 +294,10 @@ def free_parameters(model: RegionalModel, jumps: BoolArray | None = None) -> Boo
 
 
 def within_bounds(model: RegionalModel, packed: FloatArray, step_s: float) -> RegionalModel:
-    """Return the model of packed parameters, with all of them moved to where they have a meaning.
+    """Return the model of packed parameters, with each of them moved inside its limits.
 
-    Lags and delays become such as rows ``step_s`` apart can show; breakpoints stay apart.
+    Lags and delays become such as rows ``step_s`` apart can show. Breakpoints are at least
+    `CLOSEST_KNOTS` of their range apart.
     """
     packed, first = packed.copy(), model.dynamic_places.start
     lags, delays = slice(first, first + model.regions), model.delay_places
@@ -305,7 +306,7 @@ def within_bounds(model: RegionalModel, packed: FloatArray, step_s: float) -> Re
     found = model.unpack(packed)
     knots = found.knots
     # Each breakpoint keeps room for those on both sides.
-    room = _CLOSEST_KNOTS * (knots[-1] - knots[0]) * np.arange(len(knots))
+    room = CLOSEST_KNOTS * (knots[-1] - knots[0]) * np.arange(len(knots))
     spread = np.maximum.accumulate(knots - room)
     return replace(found, knots=np.minimum(spread, knots[-1] - room[-1]) + room)
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis import diagnose as search
 from valveflow_ros.diagnosis.corrector import covariates_of
 from valveflow_ros.diagnosis.extended import ExtendedModel
-from valveflow_ros.diagnosis.from_window import first_model, on_top
+from valveflow_ros.diagnosis.from_window import diagnose_own, first_model, on_top
 from valveflow_ros.diagnosis.grids import LEAST_COVERED, CovariateRows
 from valveflow_ros.diagnosis.result import NAMED, Diagnosis, model_to_json, to_json
 from valveflow_ros.diagnosis.signature import views
@@ -200,7 +200,6 @@ def diagnose(
         regional = model.model.base if isinstance(model, ExtendedModel) else model.model
     if regional is None:
         regional = first_model(rows.table, step, form, settle)
-    fitted = model is None and not form.scaled and 'pressure_exponent' not in given
     beside = _covariate_rows(log, covariates, rows.table)
     record = search.Record(
         rows.table, step, form, settle, rows.spans_ns, compression=log.compression,
@@ -212,24 +211,13 @@ def diagnose(
             record, earlier, measured if rows.places is None else measured.take(rows.places)
         )
         notes.append(held_words(earlier.held))
-    part = progress.part(0.4, 0.5)
-    asked = None if model is None or earlier is not None else rows.asked(form)
-    if asked is None:
-        found = search.diagnose(record, regional, model is not None, part)
-        wrong = [c.parameters['dm'].value for c in found.causes if c.name == 'exponent']
-        if fitted and wrong:
-            # The other causes had bent the exponent that was fitted without them.
-            form = replace(form, exponent=form.exponent + wrong[0])
-            record = replace(record, form=form)
-            regional = first_model(rows.table, step, form, settle)
-            found = search.diagnose(record, regional, False, part)
-        if fitted and form != StaticForm(exponent=settings.real('pressure_exponent')):
-            notes.append(_FITTED_EXPONENT.format(form.exponent))
-    else:
-        form, there = asked
-        other = replace(record, form=form)
-        found = search.diagnose_form(record, regional, other, there, part)
-        record = other
+    found, record = _diagnosis(
+        record, regional, model, rows, 'pressure_exponent' in given, progress.part(0.4, 0.5)
+    )
+    form = record.form
+    usual = StaticForm(exponent=settings.real('pressure_exponent'))
+    if model is None and not form.scaled and form != usual:
+        notes.append(_FITTED_EXPONENT.format(form.exponent))
     kept = () if log.compression is None else (log.compression.sentence,)
     if found.disturbance is not None and not beside:
         notes.append(_TRY_A_COLUMN)
@@ -248,6 +236,22 @@ def diagnose(
         recorded_history(log.contents), _exponent_shown(rows.table, form), settings.output_unit,
     )  # fmt: skip
     return DiagnosisResult(data, form, earlier)
+
+
+def _diagnosis(
+    record: search.Record, regional: RegionalModel, model: Characteristic | ExtendedModel | None,
+    rows: _Rows, exponent_given: bool, progress: Callable[[float, str], None],
+) -> tuple[Diagnosis, search.Record]:  # fmt: skip
+    """Diagnose a record by where its model comes from; return also the record in its last form."""
+    if model is None and not exponent_given:
+        return diagnose_own(record, regional, progress)
+    held = isinstance(model, ExtendedModel) and model.held
+    asked = None if model is None or held else rows.asked(record.form)
+    if asked is None:
+        return search.diagnose(record, regional, model is not None, progress), record
+    form, there = asked
+    other = replace(record, form=form)
+    return search.diagnose_form(record, regional, other, there, progress), other
 
 
 def _exponent_shown(table: SampleTable, form: StaticForm) -> float:
