@@ -46,7 +46,7 @@ from valveflow_ros.records import (
     SpecialSegment,
 )
 from valveflow_ros.report.data import REASON_WORDS
-from valveflow_ros.report.first_run import SENTENCE, is_first_run
+from valveflow_ros.report.first_run import SENTENCE, compile_beside, is_first_run
 from valveflow_ros.report.words import duration, moment
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
 from valveflow_ros.signals.align import Aligned, Aligner, aligned_blocks
@@ -185,6 +185,7 @@ def observe_log(
     check_address_space(WORKING_BYTES)
     if is_first_run():
         progress.say(SENTENCE)
+        compile_beside()
     covariates = Covariates.of(log, model, said)
     corrector = covariates.corrector_of(model, settings)
     return observe(log.readings, settings, shown or progress, corrector, covariates)

@@ -1,12 +1,19 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Check whether the engine must be compiled first, which is done once."""
+"""Check whether the engine must be compiled first, which is done once; use two cores for it."""
 
 from __future__ import annotations
 
+import atexit
+import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
+
+import numpy as np
+
+from valveflow_ros.numerics import cores
 
 SENTENCE = 'The program is now compiled for this machine, once. This takes about half a minute.'
 _FOLDERS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
@@ -23,6 +30,36 @@ def is_first_run() -> bool:
     from valveflow_ros.monitoring import monitor  # noqa: F401 - what is asked about must be loaded
 
     return _cold_share() > 0.5
+
+
+def compile_beside() -> None:
+    """Start a process that compiles the joint fit while this one compiles what comes before it.
+
+    Numba compiles on one core only. The process ends with this one at the latest.
+    """
+    if cores() < 2 or not sys.executable:
+        return
+    command = sys.executable, '-c', f'from {__name__} import compile_fit; compile_fit()'
+    nowhere = subprocess.DEVNULL
+    with suppress(OSError):
+        beside = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere)
+        atexit.register(beside.kill)
+
+
+def compile_fit() -> None:
+    """Compile the loops of the joint fit into numba's cache, those that are needed last first."""
+    from valveflow_ros.curve.regional_model import RegionalModel
+    from valveflow_ros.fit.problem import Problem, Samples
+
+    u, usable = np.linspace(1000.0, 2000.0, 64), np.ones(64, dtype=np.uint8)
+    problem = Problem(Samples(u, 0.1 * u, usable, step_s=1.0, settle_s=0.0, group=2))
+    model = RegionalModel(
+        knots=np.array([1000.0, 2000.0]), left=np.array([100.0]), right=np.array([200.0]),
+        levels=np.array([150.0]), time_constants=np.full(2, 10.0), delays=np.zeros(2),
+    )  # fmt: skip
+    ar = np.zeros(4)
+    problem.normal(model, ar)
+    problem.cost(model, ar)
 
 
 def must_compile_to_fit() -> bool:
