@@ -46,7 +46,7 @@ def rows_of(figure):
     return list(csv.DictReader(io.StringIO(figure_csv(figure))))
 
 
-@pytest.mark.parametrize('name', ['curve', 'choice', 'coverage', 'history', 'alarms', 'map-time'])
+@pytest.mark.parametrize('name', ['curve', 'coverage', 'alarms', 'map-time'])
 def test_a_picture_becomes_png_and_svg_the_same_each_time(figures, name):
     pytest.importorskip('matplotlib')
     files = figure_files(figures[name])
@@ -62,7 +62,7 @@ def test_a_picture_becomes_png_and_svg_the_same_each_time(figures, name):
         assert figure_files(figures[name]) == files
 
 
-@pytest.mark.parametrize('days', [0.3, 1.0, 1.99, 5.0, 59.0, 400.0])
+@pytest.mark.parametrize('days', [0.3, 1.99, 59.0, 400.0])
 def test_half_a_picture_has_room_for_its_times(days):
     pytest.importorskip('matplotlib')
     at = START_NS / 1e6 + 86400e3 * days * np.linspace(0.0, 1.0, 9)
