@@ -73,15 +73,11 @@ def test_what_somebody_waits_for_is_on_disk_before_its_time(folder):
     assert not recorder.flush(PATIENCE_S)
 
 
-@pytest.mark.parametrize('once', [False, True])
-@pytest.mark.parametrize('call', range(1, 61))
-def test_whatever_call_fails_nothing_is_lost_and_every_whole_file_is_listed(folder, call, once):
-    """A file that has its name is named in metadata.yaml, and a lock is never kept."""
-    error = (errno.EIO, errno.ENOSPC, SHORT)[call % 3] if once else errno.EIO
-    faults = Faults('recorder', call, error, once)
+def recorded_with(faults, folder, parts):
+    """Record five messages into each of some splits; a fault lasts until it has been seen."""
     with faults.active():
         recorder = recorder_of(folder)
-        for part in range(6):
+        for part in range(parts):
             record(recorder, 5 * part, 5)
             recorder.rotate()
 
@@ -94,14 +90,25 @@ def test_whatever_call_fails_nothing_is_lost_and_every_whole_file_is_listed(fold
                 faults.heal()
             wait_for(settled)
             assert balanced(recorder.status())
-        status = recorder.close()
-    assert faults.failed_at_s is not None
-    assert (status.state, status.reason, status.written) == (RecorderState.STOPPED, '', 30)
-    listed = yaml.safe_load((folder / 'metadata.yaml').read_text())
-    names = listed['rosbag2_bagfile_information']['relative_file_paths']
-    assert sorted(names) == sorted(p.name for p in folder.glob('*.mcap'))
-    assert not any(is_held(part) for part in folder.glob('*.part'))
-    assert values_in(folder) == list(range(30))
+        return recorder.close()
+
+
+@pytest.mark.parametrize('once', [False, True])
+def test_whatever_call_fails_nothing_is_lost_and_every_whole_file_is_listed(tmp_path, once):
+    """A file that has its name is named in metadata.yaml, and a lock is never kept."""
+    for call in range(1, 41):
+        folder = tmp_path / f'{call}' / 'log'
+        error = (errno.EIO, errno.ENOSPC, SHORT)[call % 3] if once else errno.EIO
+        faults = Faults('recorder', call, error, once)
+        status = recorded_with(faults, folder, parts=4)
+        assert faults.failed_at_s is not None, call
+        told = status.state, status.reason, status.written
+        assert told == (RecorderState.STOPPED, '', 20), (call, faults.what)
+        listed = yaml.safe_load((folder / 'metadata.yaml').read_text())
+        names = listed['rosbag2_bagfile_information']['relative_file_paths']
+        assert sorted(names) == sorted(p.name for p in folder.glob('*.mcap')), (call, faults.what)
+        assert not any(is_held(part) for part in folder.glob('*.part')), (call, faults.what)
+        assert values_in(folder) == list(range(20)), (call, faults.what)
 
 
 def test_a_full_disk_keeps_all_waiting_until_space_returns(folder):

@@ -265,29 +265,34 @@ def test_leftovers_of_the_dead_are_finished(part):
         assert yaml.safe_load(text)['relative_file_paths'] == [path.name]
 
 
-@pytest.mark.parametrize('call', range(1, 41))
-def test_wherever_a_recovery_fails_the_next_one_completes_it(part, call):
+def test_wherever_a_recovery_fails_the_next_one_completes_it(tmp_path):
     """All messages stand in the part or in the whole file at every moment, never in neither."""
-    folder, parts = part.parent, [part, *placed(part, 3)]
-    before = open_descriptors()
-    faults = Faults(MAIN, call, errno.EIO)
-    with faults.active():
-        try:
-            recover_leftovers(folder)
-        except RecordingError as error:
-            assert 'input/output error' in str(error).lower()
-    assert open_descriptors() == before
-    whole = [path.with_suffix('') for path in parts]
-    for unfinished, finished in zip(parts, whole, strict=True):
-        assert unfinished.exists() or finished.exists()
-        if finished.exists():
-            assert len(open_log(finished).readings) == 400
-    reports = recover_leftovers(folder)
-    assert all(report.messages == 400 for report in reports)
-    names = {name for name in names_in(folder) if not name.startswith('.')}
-    assert names == {'log_0.mcap', 'log_3.mcap', 'metadata.yaml'} or not reports
-    assert [len(open_log(path).readings) for path in whole] == [400, 400]
-    assert not any(folder.glob('*.part'))
+    (left, wanted), before = write_part(tmp_path / 'log', chunks=3), open_descriptors()
+    for call in range(1, 200):
+        folder = tmp_path / f'{call}'
+        folder.mkdir()
+        parts = [Path(shutil.copy(left, folder / f'log_{k}.mcap.part')) for k in (0, 3)]
+        faults = Faults(MAIN, call, errno.EIO)
+        with faults.active():
+            try:
+                recover_leftovers(folder)
+            except RecordingError as error:
+                assert 'input/output error' in str(error).lower()
+        assert open_descriptors() == before, call
+        whole = [path.with_suffix('') for path in parts]
+        for unfinished, finished in zip(parts, whole, strict=True):
+            assert unfinished.exists() or finished.exists()
+            if finished.exists():
+                assert len(open_log(finished).readings) == len(wanted), call
+        reports = recover_leftovers(folder)
+        assert all(report.messages == len(wanted) for report in reports), call
+        names = {name for name in names_in(folder) if not name.startswith('.')}
+        assert names == {'log_0.mcap', 'log_3.mcap', 'metadata.yaml'} or not reports, call
+        assert [len(open_log(path).readings) for path in whole] == 2 * [len(wanted)], call
+        assert not any(folder.glob('*.part'))
+        if faults.failed_at_s is None:
+            break
+    assert 20 < call < 199
 
 
 def test_a_folder_without_leftovers_is_not_touched(tmp_path):

@@ -107,9 +107,8 @@ def test_a_table_is_written_as_csv_or_parquet(tmp_path):
 LARGE = 'The numbers in the time column are too large for seconds and were taken as {}.'
 
 
-@pytest.mark.parametrize(
-    ('text', 'offset_ns', 'unit'),
-    [
+def test_times_are_understood_to_the_nanosecond(tmp_path):
+    for text, offset_ns, unit in (
         ('2024-01-01T12:00:00Z', 0, ''),
         ('2024-01-01T13:00:00+01:00', 0, ''),
         ('2024-01-01 12:00:00', 0, ''),
@@ -119,12 +118,10 @@ LARGE = 'The numbers in the time column are too large for seconds and were taken
         ('1704110400500', 500_000_000, 'ms'),
         ('1704110400000250', 250_000, 'us'),
         ('1704110400000000001', 1, 'ns'),
-    ],
-)
-def test_times_are_understood_to_the_nanosecond(tmp_path, text, offset_ns, unit):
-    raw = read(tmp_path, *timed(text))
-    assert raw.time_ns.tolist() == [NOON + offset_ns]
-    assert raw.notes == ((LARGE.format(unit),) if unit else ())
+    ):
+        raw = read(tmp_path, *timed(text))
+        assert raw.time_ns.tolist() == [NOON + offset_ns], text
+        assert raw.notes == ((LARGE.format(unit),) if unit else ()), text
 
 
 def test_parquet_stamps_of_any_kind(tmp_path):
@@ -148,36 +145,30 @@ def test_rows_without_a_time_are_left_out_and_counted(tmp_path):
     assert raw.notes == ('3 rows have no readable time and were left out, the first is row 2.',)
 
 
-@pytest.mark.parametrize('text', ['never', ''])
-def test_a_time_that_could_be_anything_is_not_guessed(tmp_path, text):
-    with pytest.raises(InputError, match=r"'time' holds no time; .*--column time=THEIRS"):
-        read(tmp_path, *timed(text))
+def test_a_time_that_could_be_anything_is_not_guessed(tmp_path):
+    for text in ('never', ''):
+        with pytest.raises(InputError, match=r"'time' holds no time; .*--column time=THEIRS"):
+            read(tmp_path, *timed(text))
 
 
-@pytest.mark.parametrize(
-    ('times', 'powers', 'kind'),
-    [
+def test_rows_are_sorted_by_time_and_that_is_said(tmp_path):
+    for times, powers, kind in (
         ((3, 2, 2, 1), [603, 602, 601, 600], 'newest first'),
         ((3, 1, 2, 1), [601, 603, 602, 600], 'not in the order of time'),
         ((1, 1, 2), [600, 601, 602], ''),
-    ],
-)
-def test_the_order_of_rows(tmp_path, times, powers, kind):
-    raw = read(tmp_path, *timed(*times))
-    assert raw.time_ns.tolist() == [SECOND * time for time in sorted(times)]
-    assert raw.columns[POWER].tolist() == powers
-    assert raw.notes == ((f'The rows were {kind}; they were sorted.',) if kind else ())
+    ):
+        raw = read(tmp_path, *timed(*times))
+        assert raw.time_ns.tolist() == [SECOND * time for time in sorted(times)]
+        assert raw.columns[POWER].tolist() == powers
+        assert raw.notes == ((f'The rows were {kind}; they were sorted.',) if kind else ())
 
 
-@pytest.mark.parametrize('named', [{}, {'time': 'Clock', 'date': 'Day'}])
-def test_date_and_time_in_two_columns(tmp_path, named):
-    head = f'date,{HEADER}'
-    if named:
-        head = head.replace('date', 'Day').replace('time', 'Clock')
+def test_date_and_time_in_two_columns(tmp_path):
     lines = ['2024-01-01,12:00:00,50,16,538,600', '2024-01-01,12:00:01,50,16,538,601']
-    assert read(tmp_path, *lines, head=head, columns=named).time_ns.tolist() == [
-        NOON, NOON + SECOND
-    ]  # fmt: skip
+    own, theirs = f'date,{HEADER}', f'Day,{HEADER.replace("time", "Clock")}'
+    for head, named in ((own, {}), (theirs, {'time': 'Clock', 'date': 'Day'})):
+        found = read(tmp_path, *lines, head=head, columns=named)
+        assert found.time_ns.tolist() == [NOON, NOON + SECOND]
 
 
 # Cells -----------------------------------------------------------------------------------------
@@ -206,13 +197,6 @@ def test_cells_that_are_no_numbers_are_missing_and_told(tmp_path):
     )
 
 
-def test_digits_are_read_to_the_nearest_double(tmp_path):
-    generator = np.random.default_rng(5)
-    values = generator.normal(size=2000) * 10.0 ** generator.integers(-20, 20, 2000)
-    raw = read(tmp_path, *(f'{k},{v!r},1,1,1' for k, v in enumerate(values.tolist())))
-    assert np.array_equal(raw.columns[OPENING], values)
-
-
 def test_doubtful_values_keep_their_quality(tmp_path):
     lines = [f'{line},{code}' for line, code in zip(timed(1, 2, 3, 4), '0127', strict=True)]
     contents = open_log(csv(tmp_path, lines, f'{HEADER},generated_power_mw_quality'))
@@ -238,43 +222,21 @@ def test_columns_by_other_names(tmp_path):
     assert raw.names == {OPENING: 'LV_106', POWER: 'FT 115'}
 
 
-@pytest.mark.parametrize(
-    ('head', 'columns', 'match'),
-    [
-        (
-            'time,valve_opening_percent,power',
-            {},
-            r'recognised as main_steam_pressure.* or .*the columns are: time, '
-            r'valve_opening_percent.* --column',
-        ),
-        (
-            'time,valve_opening_percent,power',
-            {'generated_power': 'P'},
-            r"no column 'P', no column was recognised as main_steam.* --column",
-        ),
-        (
-            'time,valve_opening_percent,power',
-            {'time': 'Zeit'},
-            r"no column 'Zeit'.*--column time=THEIRS",
-        ),
-        (
-            'time,valve_opening_percent,power',
-            {'pressure': 'p'},
-            r"no signal 'pressure'; there are valve_opening_percent, main",
-        ),
-        (
-            HEADER.partition(',')[2],
-            {},
-            'no column was recognised as time; .*--column time=THEIRS, or say with --period ',
-        ),
+def test_a_missing_or_ambiguous_column_is_one_sentence_with_the_cure(tmp_path):
+    few = 'time,valve_opening_percent,power'
+    for head, columns, said in (
+        (few, {}, r'recognised as main_steam_pressure.* or .*the columns are: time, '
+                  r'valve_opening_percent.* --column'),
+        (few, {'generated_power': 'P'},
+         r"no column 'P', no column was recognised as main_steam.* --column"),
+        (few, {'time': 'Zeit'}, r"no column 'Zeit'.*--column time=THEIRS"),
+        (few, {'pressure': 'p'}, r"no signal 'pressure'; there are valve_opening_percent, main"),
+        (HEADER.partition(',')[2], {},
+         'no column was recognised as time; .*--column time=THEIRS, or say with --period '),
         ('time,a,a ', {'valve_opening': 'a'}, "several columns called 'a'"),
-    ],
-)
-def test_a_missing_or_ambiguous_column_is_one_sentence_with_the_cure(
-    tmp_path, head, columns, match
-):
-    with pytest.raises(InputError, match=match):
-        read(tmp_path, '1,2,3,4'[: head.count(',') * 2 + 1], head=head, columns=columns)
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=said):
+            read(tmp_path, '1,2,3,4'[: head.count(',') * 2 + 1], head=head, columns=columns)
 
 
 def test_the_only_column_in_a_unit_of_a_missing_signal_is_proposed(tmp_path):
@@ -288,9 +250,8 @@ def test_the_only_column_in_a_unit_of_a_missing_signal_is_proposed(tmp_path):
         read(tmp_path, '2026-01-01 00:00:00,160,80,538,290,3', head=f'{head},20MKA_P [MW]')
 
 
-@pytest.mark.parametrize(
-    ('told', 'unit', 'expected'),
-    [
+def test_a_gauge_is_known_by_the_words_beside_its_unit():
+    for told, unit, expected in (
         ('Frischdampfdruck (Überdruck)', 'bar', 'barg'),
         ('Main steam pressure gauge', 'MPa', 'MPag'),
         ('main_steam_pressure_gauge_bar', 'bar', 'barg'),
@@ -303,11 +264,9 @@ def test_the_only_column_in_a_unit_of_a_missing_signal_is_proposed(tmp_path):
         ('Brennstoffdruck Brüden', 'bar', 'bar'),
         ('Dampfdruck Ü', 'barg', 'barg'),
         ('Temperatur rel.', '°C', 'degC'),
-    ],
-)
-def test_a_gauge_is_known_by_the_words_beside_its_unit(told, unit, expected):
-    found = of_gauge(spelling(unit), told)
-    assert (found.unit, found.written) == (expected, unit)
+    ):
+        found = of_gauge(spelling(unit), told)
+        assert (found.unit, found.written) == (expected, unit), told
 
 
 def test_every_bad_table_is_one_sentence(tmp_path):

@@ -142,16 +142,16 @@ def test_the_metadata_file_says_what_is_there(tmp_path):
     assert isinstance(info['custom_data'], dict)
 
 
-@pytest.mark.parametrize('size', [1, 1000, 70_000])
-def test_a_chunk_is_closed_by_the_message_that_fills_64_kib(tmp_path, size):
+def test_a_chunk_is_closed_by_the_message_that_fills_64_kib(tmp_path):
     """So much and no more is lost with a chunk, and so much is compressed at once."""
-    row = Message('/a', bytes(size), START_NS, START_NS)
-    raw = write_messages(tmp_path, {'/a': FLOAT64}, [row] * (250_000 // (31 + size))).read_bytes()
-    heads = [begin for op, begin, _ in records(raw) if op == Opcode.CHUNK]
-    sizes = [int.from_bytes(raw[begin + 25 : begin + 33], 'little') for begin in heads]
-    assert len(sizes) > 2
-    # The tables of topics stand in some of them, too; they are small.
-    assert all(65536 <= n < 65536 + 31 + size + 2000 for n in sizes[:-1])
+    for size in (1, 1000, 70_000):
+        rows = [Message('/a', bytes(size), START_NS, START_NS)] * (250_000 // (31 + size))
+        raw = write_messages(tmp_path / str(size), {'/a': FLOAT64}, rows).read_bytes()
+        heads = [begin for op, begin, _ in records(raw) if op == Opcode.CHUNK]
+        sizes = [int.from_bytes(raw[begin + 25 : begin + 33], 'little') for begin in heads]
+        assert len(sizes) > 2
+        # The tables of topics stand in some of them, too; they are small.
+        assert all(65536 <= n < 65536 + 31 + size + 2000 for n in sizes[:-1])
 
 
 def test_only_the_owner_may_look(tmp_path):
