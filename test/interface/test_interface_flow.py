@@ -37,6 +37,11 @@ def flow(frame, factor, unit='t/h'):
 
 
 @pytest.fixture(scope='module')
+def in_tons(frame):
+    return vf.identify(flow(frame, 3.0))
+
+
+@pytest.fixture(scope='module')
 def small(frame):
     return curve_of(flow(frame, 0.01, 'kg/s'))
 
@@ -70,8 +75,8 @@ def test_a_scaled_output_gives_the_scaled_curve(frame, usual, small, factor, uni
         assert mine.delay_s == pytest.approx(theirs.delay_s, abs=0.5 * theirs.delay_stderr_s)
 
 
-def test_everything_that_is_told_of_a_flow_is_in_its_unit(frame, tmp_path):
-    found = vf.identify(flow(frame, 3.0))
+def test_everything_that_is_told_of_a_flow_is_in_its_unit(in_tons, tmp_path):
+    found = in_tons
     found.write(tmp_path, tables=True)
     names = [f'tables/{f.name}.csv' for f in found.page().figures]
     for name in ('characteristic.json', *names):
@@ -84,11 +89,12 @@ def test_everything_that_is_told_of_a_flow_is_in_its_unit(frame, tmp_path):
     assert found.to_json()['output_unit'] == 't/h'
 
 
-def test_the_unit_stays_with_the_curve_and_another_one_is_refused(frame, log, usual, tmp_path):
-    made = vf.identify(flow(frame, 3.0))
-    made.write(tmp_path)
+def test_the_unit_stays_with_the_curve_and_another_one_is_refused(
+    frame, log, usual, in_tons, tmp_path
+):
+    in_tons.write(tmp_path)
     read = vf.load_characteristic(tmp_path)
-    assert (read.output_unit, read.model_id) == ('t/h', made.characteristic.model_id)
+    assert (read.output_unit, read.model_id) == ('t/h', in_tons.characteristic.model_id)
     assert vf.validate(flow(frame, 3.0), tmp_path).output_unit == 't/h'
     for wrong, curve in ((log, read), (flow(frame, 3.0), usual), (flow(frame, 3.0, 'kg/s'), read)):
         for call in (
@@ -100,9 +106,9 @@ def test_the_unit_stays_with_the_curve_and_another_one_is_refused(frame, log, us
                 call(wrong, curve)
 
 
-@pytest.mark.parametrize('pressure_mpa', [1.0, 4.0])
-def test_a_curve_at_one_pressure_is_told_over_the_opening(frame, pressure_mpa, tmp_path):
+def test_a_curve_at_one_pressure_is_told_over_the_opening(frame):
     """A control valve with opening and flow only; the file keeps u."""
+    pressure_mpa = 4.0
     u = frame['valve_opening_percent'] * (frame['main_steam_pressure_mpa'] / 16.0) ** 1.125
     table = frame.assign(valve_opening_percent=u, main_steam_pressure_mpa=pressure_mpa)
     found = vf.identify(flow(table, 3.0))

@@ -130,7 +130,8 @@ def test_an_exponent_at_the_end_of_its_range_is_said():
 
 
 def test_the_exponent_of_a_healthy_unit_is_a_cause_only_if_another_one_was_given():
-    log = plant(unit='integrated_input:number=2,vacuum_per_kpa=0').log
+    unit = 'integrated_input:number=2,vacuum_per_kpa=0'
+    log = vf.simulate(2.0, 3, unit=unit, recording='minute').log
     own, asked = vf.diagnose(log), vf.diagnose(log, parameters={'pressure_exponent': 1.125})
     assert 'exponent' not in {c.name for c in own.diagnosis.causes}
     assert own.form.exponent == pytest.approx(1.06, abs=0.03)
@@ -149,14 +150,15 @@ def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
 
 def test_a_model_of_the_wrong_form_is_the_first_finding_and_one_of_the_right_form_none(tmp_path):
     given = identified(INTEGRATED_INPUT).characteristic
-    found = vf.diagnose(plant(4).log, model=given).diagnosis
+    later = vf.simulate(3.0, 4, unit=UNIT, recording='minute')
+    found = vf.diagnose(later.log, model=given).diagnosis
     assert found.verdict == 'named'
     form = found.causes[0]
     assert form.name == 'form'
     assert 'fixed openings' in form.sentence
     assert form.gain.rmse_after < 0.5 * form.gain.rmse_before
     assert form.gain.p_value < 0.01
-    right = vf.diagnose(plant(4).log, model=identified().characteristic)
+    right = vf.diagnose(later.log, model=identified().characteristic)
     assert not {'form', 'choked', 'exponent'} & {c.name for c in right.diagnosis.causes}
     unjudged = dict(right.diagnosis.rejected)
     assert 'are results of the fit' in unjudged['exponent'] == unjudged['curve_shape']
@@ -164,7 +166,7 @@ def test_a_model_of_the_wrong_form_is_the_first_finding_and_one_of_the_right_for
     right.write(tmp_path)
     model = load_model(tmp_path / 'extended_model.json')
     assert model.form.axis == OPENING
-    assert error_mw(plant(4), model.characteristic()) < 1.0
+    assert error_mw(later, model.characteristic()) < 1.0
 
 
 def test_other_days_are_validated_and_curves_of_both_forms_held_against_each_other():

@@ -363,14 +363,12 @@ def test_one_change_is_refused_or_possible_at_every_door(tmp_path: Path, kind: s
     assert refused > 0.5 * tried
 
 
-@pytest.mark.parametrize('name', ['0', '101', '9' * 5000, '٣', '1.0', ''])
-def test_numbers_of_pieces_that_cannot_be_are_refused(tmp_path: Path, name: str) -> None:
-    raw = copy.deepcopy(CURVE)
-    raw['selection']['cost'][name] = 1.0
+def test_numbers_of_pieces_that_cannot_be_are_refused(tmp_path: Path) -> None:
     path = tmp_path / 'given.json'
-    path.write_text(json.dumps(raw))
-    with pytest.raises(RecordingError, match=r"'selection\.cost' has a key"):
-        load_characteristic(path)
+    for name in ('0', '101', '9' * 5000, '٣', '1.0', ''):
+        path.write_text(json.dumps(changed(CURVE, ('selection', 'cost', name), 1.0)))
+        with pytest.raises(RecordingError, match=r"'selection\.cost' has a key"):
+            load_characteristic(path)
 
 
 def test_models_on_top_of_one_another_end(tmp_path: Path) -> None:
