@@ -62,26 +62,27 @@ def test_a_short_log_leaves_the_noise_to_the_monitor(run, slow_table, tmp_path):
     Settings(yaml.safe_load(ran.out)['/**']['ros__parameters'])
 
 
-@pytest.mark.parametrize(
-    ('text', 'parts'),
-    [
-        ('/**:\n  ros__parameters:\n    dellay: 3\n    block: fast\n    delay: 2.0\n',
-         ["'dellay' does not exist; did you mean 'delay'?", "'block' must be a number"]),
-        ('/**:\n  ros__parameters:\n    block: 0.5\n', ['must not be below sample_period']),
-        ('/**:\n  ros__parameters:\n    [\n', ['no YAML file']),
-        ("/**:\n  ros__parameters:\n    covariates: 'backlash=/x'\n",
-         ["Parameter 'covariates' cannot be used: entry 'backlash' is a"]),
-        ('delay: 3.0\n', ['Put the lines']),
-        ('valveflow_monitor:\n  delay: 3.0\n', ['Put the lines']),
-        ('/**:\n  ros__parameters: 3\n', ['Put the lines']),
-        ('/**:\n  ros__parameters:\n  delay: 3.0\n', ['Put the lines']),
-    ],
-)  # fmt: skip
-def test_what_the_monitor_would_refuse_is_named(run, tmp_path, text, parts):
+# The file, and what is said of it.
+BAD_FILES = [
+    ('/**:\n  ros__parameters:\n    dellay: 3\n    block: fast\n    delay: 2.0\n',
+     ["'dellay' does not exist; did you mean 'delay'?", "'block' must be a number"]),
+    ('/**:\n  ros__parameters:\n    block: 0.5\n', ['must not be below sample_period']),
+    ('/**:\n  ros__parameters:\n    [\n', ['no YAML file']),
+    ("/**:\n  ros__parameters:\n    covariates: 'backlash=/x'\n",
+     ["Parameter 'covariates' cannot be used: entry 'backlash' is a"]),
+    ('delay: 3.0\n', ['Put the lines']),
+    ('valveflow_monitor:\n  delay: 3.0\n', ['Put the lines']),
+    ('/**:\n  ros__parameters: 3\n', ['Put the lines']),
+    ('/**:\n  ros__parameters:\n  delay: 3.0\n', ['Put the lines']),
+]  # fmt: skip
+
+
+def test_what_the_monitor_would_refuse_is_named(run, tmp_path):
     file = tmp_path / 'x.yaml'
-    file.write_text(text)
-    sentence = run('config', 'check', file).refused()
-    assert all(part in sentence for part in ['x.yaml', *parts])
+    for text, parts in BAD_FILES:
+        file.write_text(text)
+        sentence = run('config', 'check', file).refused()
+        assert all(part in sentence for part in ['x.yaml', *parts]), text
 
 
 @pytest.mark.parametrize(

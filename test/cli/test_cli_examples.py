@@ -12,14 +12,20 @@ from monitor_recording import recording
 from streams import needs_jit
 
 from benchmarks.refinery_loops import simulate_loop
-from valveflow_ros.cli.main import VERBS
+from valveflow_ros.cli.main import VERBS, parser_of
 
 pytestmark = needs_jit
 
 
 # What the example itself does not say: a recording that grows is watched until Ctrl-C; fewer days
-# show as well that its words are understood.
-MORE = {'watch': ['--once'], 'simulate': ['--days', '0.5']}
+# and quick fits show as well that its words are understood.
+QUICK = ['--set', 'refine=false', '--set', 'selection_rule=paper']
+MORE = {
+    'watch': ['--once'], 'simulate': ['--days', '0.5'], 'identify': QUICK, 'compare': QUICK,
+    'monitor': [*QUICK, '--no-diagnosis'],
+}  # fmt: skip
+# Its workers take longest to begin; what they do is tested without the command.
+LONG = {'fleet'}
 
 
 # A file that must be there afterwards.
@@ -60,7 +66,16 @@ def plant(tmp_path, logs, identified):
     return tmp_path
 
 
-@pytest.mark.parametrize('verb', [name for name, _, _ in VERBS])
+def test_every_example_is_understood(run):
+    for verb, _, _ in VERBS:
+        name, *words = example(run(verb, '--help').out)
+        assert name == verb
+        parser_of(verb).parse_args(words)
+
+
+@pytest.mark.parametrize('verb', [
+    pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name, _, _ in VERBS
+])  # fmt: skip
 def test_the_example_of_a_verb_works(run, plant, monkeypatch, verb):
     if verb == 'fleet':
         for name in ('dask', 'distributed', 'pyarrow'):

@@ -22,21 +22,6 @@ from valveflow_ros.signals.align import align_whole
 SHORT = ['--days', '0.02', '--seed', '4']
 
 
-def test_every_kind_of_log_holds_the_same(run, tmp_path):
-    names = ['a.csv', 'a.parquet', 'a.mcap', 'bag']
-    for name in names:
-        ran = run('simulate', '-o', tmp_path / name, *SHORT).done()
-        assert name in ran.out
-    first = open_log(tmp_path / names[0]).readings
-    for name in names[1:]:
-        readings = open_log(tmp_path / name).readings
-        for info in SIGNALS:
-            mine, theirs = first.signal == info.signal, readings.signal == info.signal
-            assert np.array_equal(first.value[mine], readings.value[theirs]), (name, info.topic)
-            assert np.array_equal(first.time_ns[mine], readings.time_ns[theirs])
-    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
-
-
 def test_the_files_that_were_written_are_named(run, tmp_path):
     log, beside, truth = (tmp_path / n for n in ('a.mcap', 'metadata.yaml', 'truth.json'))
     ran = run('simulate', '-o', log, '--truth', truth, *SHORT)

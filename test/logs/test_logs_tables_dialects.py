@@ -225,6 +225,8 @@ def test_the_hour_that_comes_twice(tmp_path, monkeypatch, zone, block, newest_fi
     monkeypatch.setattr(file, 'BLOCK_ROWS', block)
     raw = read_table(path, options=TableOptions(time_zone=zone))
     assert raw.time_ns.tolist() == ns(truth.tz_localize(None))
+    power = raw.columns['generated_power_mw']
+    assert power.tolist() == [600.0 + k for k in range(len(truth))], 'each row keeps its values'
     assert any('120 rows are in the hour that comes twice' in note for note in raw.notes)
     if not newest_first:
         with pytest.raises(InputError, match=r'go back by an hour .* --time-zone'):
