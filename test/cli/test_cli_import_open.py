@@ -12,10 +12,9 @@ from logged import values
 from streams import flow_valve
 
 import valveflow_ros as vf
-from valveflow_ros.cli.command import Console, TableOption
+from valveflow_ros.cli.command import TableOption
 from valveflow_ros.cli.main import parser_of
 from valveflow_ros.errors import InputError, UsageError
-from valveflow_ros.interface.mapping import LOOKING_ON
 from valveflow_ros.logs import open_log
 from valveflow_ros.records import Signal
 from valveflow_ros.signals.units import convert
@@ -106,14 +105,6 @@ def test_a_suggested_command_holds_with_values_that_begin_with_a_dash(
     readings = open_log(tmp_path / '-x.mcap').readings
     first = np.datetime64('2026-02-01T05:00:00', 'ns').astype(np.int64)
     assert readings.time_ns.min() == first
-
-
-@pytest.mark.parametrize('verb', ['import', 'info'])
-def test_looking_on_shows_that_it_is_at_work(run, table, monkeypatch, verb):
-    told = []
-    monkeypatch.setattr(Console, '__call__', lambda _, share, what: told.append(what))
-    run(verb, table, *(['--dry-run'] if verb == 'import' else [])).refused()
-    assert LOOKING_ON in told
 
 
 def test_the_other_verbs_name_all_options_in_one_line(run, table, tmp_path):

@@ -240,17 +240,6 @@ def test_export_writes_what_a_monitor_said(run, logs, tmp_path):
     assert 'contains no monitor output' in none
 
 
-def test_recover_reports_damage_outside_of_the_chunks(run, logs, tmp_path):
-    """A byte that flips there costs no message."""
-    content = bytearray((logs / 'plant.mcap').read_bytes())
-    content[-12] ^= 0x10
-    broken = tmp_path / 'a.mcap'
-    broken.write_bytes(content)
-    ran = run('recover', broken, '-o', tmp_path / 'b.mcap')
-    assert 'no other chunk is damaged' in ran.out
-    assert 'The summary of the file is damaged' in ran.err
-
-
 def test_a_folder_named_by_a_dot_has_its_name(logs, tmp_path, monkeypatch):
     home = tmp_path / 'unit7'
     home.mkdir()

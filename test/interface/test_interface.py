@@ -473,14 +473,6 @@ class TestOtherUnits:
         assert shift.since_ns == 0
         assert 'since when is not known' in shift.sentence
 
-    def test_tables_hold_further_columns(self, tmp_path):
-        plant = vf.simulate(0.01, 3, unit='sequence')
-        plant.write(tmp_path / 'a.csv')
-        table = pd.read_csv(tmp_path / 'a.csv')
-        valves = [f'valve_{n}_position_percent' for n in range(1, 4)]
-        for column in ('condenser_pressure_kpa', 'grid_frequency_hz', *valves):
-            np.testing.assert_array_equal(table[column], plant.to_dataframe()[column])
-
     def test_the_truth_tells_form_and_static_power(self):
         plant = vf.simulate(0.01, 3, ['backlash'], unit='choked:number=4', recording='minute')
         truth = plant.to_json()

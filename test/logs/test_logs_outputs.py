@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from monitor_recording import START_NS, Monitor, alarm, cdr, head, recording
 
-from valveflow_ros.errors import DataError
 from valveflow_ros.interface.files import write_outputs
 from valveflow_ros.logs import open_log
 
@@ -82,11 +81,3 @@ def test_csv_and_parquet_say_the_same(folder):
         for name in parquet.columns:
             pairs = zip(csv[name], parquet[name], strict=True)
             assert all(same_cell(*pair) for pair in pairs), (kind, name)
-
-
-def test_a_log_without_a_monitor_is_refused(tmp_path):
-    monitor = Monitor(tmp_path / 'silent')
-    monitor.say('/valve_opening', b'\x00\x01\x00\x00' + bytes(8))
-    monitor.writer.close()
-    with pytest.raises(DataError, match='contains no monitor output'):
-        write_outputs(open_log(tmp_path / 'silent'), tmp_path / 'x.csv')

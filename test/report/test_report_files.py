@@ -73,12 +73,6 @@ def test_half_a_picture_has_room_for_its_times(days):
     assert 2 <= drawn['half.svg'].count(b'"xtick_') <= 5
 
 
-def test_without_matplotlib_one_sentence_says_what_to_do(figures, monkeypatch):
-    monkeypatch.setattr(drawing, 'find_spec', lambda name: None)
-    with pytest.raises(InputError, match='pip install matplotlib'):
-        figure_files(figures['curve'])
-
-
 def test_a_matplotlib_that_cannot_be_loaded_is_refused_before_any_work(monkeypatch, tmp_path):
     pytest.importorskip('matplotlib')
 
@@ -120,15 +114,6 @@ def test_every_table_has_every_point_that_is_drawn(figures):
                 known = np.isfinite(numbers(trace, 'x')) & np.isfinite(numbers(trace, 'y'))
                 drawn += int(known.sum())
         assert len(rows_of(figure)) == drawn, figure.name
-
-
-def test_packed_and_stepped_places_are_read_back():
-    x = np.array([1.0, np.nan, 3.0])
-    assert np.array_equal(numbers({'x': packed(x)}, 'x'), x, equal_nan=True)
-    stepped = {'x0': 5.0, 'dx': 0.5, 'y': [1.0, None, 2.0]}
-    assert numbers(stepped, 'x').tolist() == [5.0, 5.5, 6.0]
-    figure = Figure('f', '', '', [{'type': 'scatter', 'name': 'a "b"', **stepped}])
-    assert [r['line'] for r in rows_of(figure)] == ['a "b"'] * 2
 
 
 @pytest.mark.parametrize(('off', 'told'), [('0', 'True True'), ('1', 'False False')])
