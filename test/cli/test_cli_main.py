@@ -189,6 +189,8 @@ REFUSED = [
     ('simulate -o none/x.mcap', 1, 'there is no folder'),
     ('simulate -o x.mcap --seed -1', 2, '0 or more'),
     ('simulate -o x.mcap --effect gain_drif', 2, "Did you mean 'gain_drift'"),
+    ('simulate -o x.mcap --effect gain_drift:h=1', 2, "no parameter 'h'"),
+    ('simulate -o x.mcap --effect gain_drift:g=big', 2, "not 'big'"),
     ('simulate -o x.csv --truth no/t.json', 1, 'cannot be written'),
     ('import LOG -o x.bag', 1, 'must end in'),
     ('import LOG -o x.mcap --column main_steam_pressure=P:stone', 2, 'MPa, kPa, Pa, bar, psi'),

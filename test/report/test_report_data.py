@@ -74,6 +74,12 @@ def test_holes_show_when_they_were_and_a_whole_log_needs_no_picture(identified):
     assert [g.seconds for g in gaps(short.time_ns, identified.period_ns)] == [30_010.0]
 
 
+def test_gaps_are_found_the_longest_first():
+    time_ns = np.array([0, 1, 2, 5, 6, 16, 17], dtype=np.int64) * 10**9
+    assert [g.seconds for g in gaps(time_ns, 10**9)] == [10.0, 3.0]
+    assert gaps(time_ns[:3], 10**9) == []
+
+
 def test_the_last_day_is_shaded_where_the_log_is_longer(identified, make):
     assert not curve_figure(identified).layout.get('shapes')
     data = make(days=2.0)
