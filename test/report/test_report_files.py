@@ -129,6 +129,20 @@ def test_the_first_run_is_known_by_the_empty_cache(tmp_path, off, told):
     assert done.stdout.strip() == told
 
 
+@pytest.mark.long
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
+def test_what_is_compiled_beside_is_what_an_identification_uses(tmp_path):
+    def run(code):
+        subprocess.run([sys.executable, '-c', code], check=True, env=there)
+        return sorted(file.name for file in tmp_path.rglob('kernels.*.nbc'))
+
+    there = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
+    beside = run('from valveflow_ros.report.first_run import compile_fit; compile_fit()')
+    assert any(name.startswith('kernels.normal_sums') for name in beside)
+    whole = run('import valveflow_ros as vf; vf.identify(vf.simulate(0.4, 1).log)')
+    assert whole == beside
+
+
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is compiled')
 @pytest.mark.parametrize(('cold', 'expected'), [('partition', True), ('no such', False)])
 def test_a_fit_must_compile_where_only_its_own_part_is_cold(monkeypatch, cold, expected):
