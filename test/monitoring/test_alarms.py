@@ -24,7 +24,6 @@ from streams import (
 from valveflow_ros.errors import DataError
 from valveflow_ros.monitoring.alarm_state import BURIED, AlarmAction
 from valveflow_ros.monitoring.alarms import AlarmChange, AlarmState
-from valveflow_ros.monitoring.events import JournalEntry, JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
 from valveflow_ros.parameters import Settings
@@ -84,30 +83,6 @@ def test_a_curve_that_cannot_be_judged_suppresses_until_one_can():
     assert (back.state, back.occurrence) == (UNACKNOWLEDGED, 1)
     (over,) = desk.judge(0.0, 4)
     assert over.state == RETURNED
-
-
-PATIENT = LONG.changed({'alarm_off_delay': 10.0, 'alarm_flood': 60})
-
-
-def returns_after_s(desk, start_s):
-    """Raise the alarm and let it be calm; return how long the calm had to last."""
-    desk.rows([2.0], start_s)
-    (back,) = desk.rows([0.0] * 100, start_s + 1)
-    return (back.time_ns - START_NS) / NS_PER_S - start_s - 1
-
-
-def test_a_residual_that_comes_back_soon_has_to_stay_away_for_longer():
-    desk = Desk(PATIENT)
-    assert [returns_after_s(desk, 101 * k) for k in range(2)] == [10.0, 10.0]  # after 90 s
-    soon, now_s = [], 300
-    for _ in range(6):
-        soon.append(returns_after_s(desk, now_s))
-        now_s += 1 + 100
-        desk = desk.taken_up()
-        desk.residual.shift_time(round(60 * NS_PER_S))
-    assert soon == [10.0, 20.0, 40.0, 80.0, 80.0, 80.0]
-    assert desk.residual.reset(START_NS, 'm') == []
-    assert returns_after_s(desk, now_s) == 10.0
 
 
 def test_a_shift_of_another_size_than_was_told_is_told_again():
@@ -202,20 +177,6 @@ def run(settings, rows, acts):
     return monitor, events
 
 
-def test_the_shelf_is_written_down_and_comes_back_by_itself():
-    acts = {850: 'shelve', 900: 'unshelve', 901: 'shelve'}
-    _, events = run(SETTINGS, plant_table(0, 1300, FAULTS), acts)
-    kinds = [e.kind for e in of_type(events, JournalEntry)]
-    assert kinds.count(JournalKind.SHELVE) == 2
-    assert kinds.count(JournalKind.UNSHELVE) == 1
-    told = [(c.state, int(c.time_ns - START_NS) // NS_PER_S + 1)
-            for c in of_type(events, AlarmChange)]  # fmt: skip
-    assert [state for state, _ in told[:5]] == [
-        UNACKNOWLEDGED, SHELVED, UNACKNOWLEDGED, SHELVED, UNACKNOWLEDGED,
-    ]  # fmt: skip
-    assert [row for _, row in told[1:5]] == [850, 900, 901, 961]
-
-
 def test_an_act_that_applies_to_none_is_refused_in_words():
     monitor, _ = run(SETTINGS, plant_table(0, 850, FAULTS), {})
     assert (monitor.alarm.standing, monitor.reference.alarm.standing) == (True, False)
@@ -237,7 +198,6 @@ def test_an_act_that_applies_to_none_is_refused_in_words():
 
 # As set by default, but for fits: few are enough to follow a plant that stays as it is.
 SEDATE = Settings({'refit_period': 43_200.0, 'refit_segments': 0})
-DAY_NS = 86_400 * NS_PER_S
 
 
 @pytest.mark.slow

@@ -189,7 +189,6 @@ def test_a_curve_comes_predicts_and_is_the_truth():
     ('changes', 'expected'),
     [
         ({'refit_period': 0.0}, 0),
-        ({'refit_segments': 0, 'refit_period': 864000.0}, 0),
         ({'min_fit_samples': 1700}, 0),
         ({'refit_segments': 1}, 5),
         ({'refit_segments': 0, 'refit_period': 60.0}, 5),
