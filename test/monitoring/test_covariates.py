@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariates in the monitor: held in step with the rows, kept in the window and in its state."""
 
-import lzma
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,19 +22,16 @@ from streams import (
 from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import CLOCK_BACK, feed_rows
-from valveflow_ros.monitoring.rows import Correction, Rows
 from valveflow_ros.parameters import Settings
-from valveflow_ros.records import N_SIGNALS, NS_PER_S, Readings, SampleTable, table_to_readings
-from valveflow_ros.segments.window import RollingWindow
+from valveflow_ros.records import N_SIGNALS, NS_PER_S, Readings, table_to_readings
 from valveflow_ros.signals.align import Aligner, gathered
-from valveflow_ros.signals.covariates import Arriving, entries_of, entry, held, parts
+from valveflow_ros.signals.covariates import Arriving, entries_of, entry, held
 from valveflow_ros.state import from_bytes, to_bytes
 
 SETTINGS = Settings(QUICK_MONITOR)
 N = 700
 VACUUM, AMBIENT = entry('vacuum', 'PT7', 'kPa'), entry('ambient', 'a:b', '')
 TWO = (VACUUM, AMBIENT)
-OLD = sorted(Path(__file__).parent.glob('state_of_*.xz'))
 
 
 def with_two(table, seed=0):
@@ -153,12 +148,6 @@ def test_values_that_wait_for_rows_are_bounded_and_a_state_without_them_is_read(
     assert 'covariates' not in Aligner(SETTINGS).snapshot()
 
 
-def test_the_parameter_gives_the_entries():
-    said = Settings({'covariates': ' vacuum=/c/p:kPa  ambient=t '})
-    assert entries_of(said) == ('vacuum=/c/p:kPa', 'ambient=t:')
-    assert [parts(text) for text in TWO] == [('vacuum', 'PT7', 'kPa'), ('ambient', 'a:b', '')]
-
-
 @pytest.mark.parametrize(
     ('text', 'sentence'),
     [
@@ -232,15 +221,6 @@ def test_a_change_of_the_parameter_keeps_curve_and_alarms_and_the_same_covariate
     assert np.isnan(seen(fresh)['ambient=t:']).all()
 
 
-@pytest.mark.parametrize('path', OLD, ids=lambda path: path.stem)
-def test_a_state_of_before_has_a_window_without_values(path):
-    saved = from_bytes(lzma.decompress(path.read_bytes()))['engine']['monitor']['window']
-    window = RollingWindow.of(SETTINGS, TWO)
-    window.restore(saved)
-    assert len(window)
-    assert np.isnan(window.contents(covariates=True).covariates[VACUUM]).all()
-
-
 @pytest.mark.parametrize('damage', [np.zeros(3), None])
 def test_a_damaged_state_is_refused(damage):
     monitor = Monitor(SETTINGS, covariates=TWO)
@@ -249,20 +229,3 @@ def test_a_damaged_state_is_refused(damage):
     saved['window']['covariates'][VACUUM] = damage
     with pytest.raises((DataError, AttributeError)):
         Monitor(SETTINGS, covariates=TWO).restore(saved)
-
-
-class Halved:
-    """A corrector that halves the power; its tables have no covariates, as real ones."""
-
-    held = ()
-
-    def correct(self, table):
-        return SampleTable(table.time_ns, 0.5 * table.values, table.quality)
-
-
-def test_removing_causes_leaves_them_as_they_are():
-    table, correction = with_two(plant_table(1, 20)), Correction(Halved())
-    Rows.of(table, 1.0, correction)
-    rows = Rows.of(table.part(7, 20), 1.0, correction)
-    np.testing.assert_array_equal(rows.covariates, table.covariates[7:])
-    np.testing.assert_array_equal(rows.part(2, 5).covariates, table.covariates[9:12])
