@@ -23,9 +23,7 @@ from streams import (
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.errors import DataError, TooFewSamplesError
-from valveflow_ros.fit import fit as fitting
 from valveflow_ros.fit.fit import fit, outline
-from valveflow_ros.fit.result import residual_statistics
 from valveflow_ros.fit.task import FitTask
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
@@ -232,14 +230,6 @@ def test_what_gives_no_curve_is_refused_with_a_sentence(harm, words):
     assert 'nan' not in sentence
 
 
-def test_too_few_samples_are_refused_with_both_numbers():
-    contents = window()
-    few = changed(contents, spans=contents.spans[:1])
-    with pytest.raises(TooFewSamplesError, match=r'45\b.*600') as caught:
-        fit(task(few, STATIC.changed({'min_fit_samples': 600})))
-    assert (caught.value.have, caught.value.need) == (45, 600)
-
-
 @pytest.mark.parametrize('jitter', [0.0, 0.005])
 def test_a_valve_that_stands_still_has_no_characteristic(jitter):
     """The pressure moves u, and the power with it, but that is no property of the valve."""
@@ -285,21 +275,6 @@ def test_a_window_too_short_for_dynamics_keeps_the_static_curve_and_says_so():
     usable(c)
     assert c.dynamics == ()
     assert any('not refined' in note for note in c.notes)
-
-
-@needs_jit
-@pytest.mark.parametrize(('rows', 'settings', 'times'), [
-    (7200, REFINED, 0), (2400, REFINED, 1), (2400, STATIC, 1),
-])  # fmt: skip
-def test_the_static_residuals_are_judged_only_if_the_static_curve_is_the_result(
-    rows, settings, times, monkeypatch
-):
-    judged = []
-    monkeypatch.setattr(
-        fitting, 'residual_statistics', lambda *a: judged.append(a) or residual_statistics(*a)
-    )
-    usable(fit(task(window(2, n=rows, time_constant=4.0), settings)))
-    assert len(judged) == times
 
 
 def broken_up(contents, run):

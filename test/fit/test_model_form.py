@@ -55,12 +55,10 @@ def late(power, time_constant_s):
 
 
 @pytest.mark.parametrize('table', TABLES)
-@pytest.mark.parametrize('exponent', [1.0, 1.1])
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('exponent', 'seed'), [(1.0, 0), (1.1, 1)])
 def test_knees_at_fixed_openings_are_found_at_sliding_pressure(table, exponent, seed) -> None:
     v, p, y, spans = unit(OPENING, table, seed, exponent=exponent)
     found = find_form(v, p, y, spans, PERIOD_S, PAPER)
-    assert found is not None
     assert found.evidence.told
     assert found.evidence.chosen == found.form.axis == OPENING
     assert found.form.exponent == pytest.approx(exponent, abs=0.02)
@@ -70,12 +68,10 @@ def test_knees_at_fixed_openings_are_found_at_sliding_pressure(table, exponent, 
 
 
 @pytest.mark.parametrize('table', TABLES)
-@pytest.mark.parametrize('exponent', [1.0, 1.125, 1.25])
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('exponent', 'seed'), [(1.0, 0), (1.125, 1), (1.25, 2)])
 def test_the_paper_s_form_is_found_with_its_exponent(table, exponent, seed) -> None:
     v, p, y, spans = unit(INTEGRATED_INPUT, table, seed, exponent=exponent)
     found = find_form(v, p, y, spans, PERIOD_S, PAPER)
-    assert found is not None
     assert found.evidence.told
     assert found.form.axis == INTEGRATED_INPUT
     if exponent == PAPER:
@@ -85,11 +81,10 @@ def test_the_paper_s_form_is_found_with_its_exponent(table, exponent, seed) -> N
 
 
 @pytest.mark.parametrize('form', [OPENING, INTEGRATED_INPUT])
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_where_the_pressure_stands_still_nothing_is_told(form, seed) -> None:
     v, p, y, spans = unit(form, 'bent', seed, slides=False)
     found = find_form(v, p, y, spans, PERIOD_S, PAPER)
-    assert found is not None
     assert not found.evidence.told
     assert found.exponent_held
     assert found.form.exponent in (1.0, PAPER)
@@ -100,8 +95,6 @@ def test_where_the_pressure_stands_still_nothing_is_told(form, seed) -> None:
 def test_a_power_that_is_late_on_ramps_has_the_same_form(form) -> None:
     v, p, y, spans = unit(form, 'bent', 3, exponent=1.1)
     here, there = (find_form(v, p, x, spans, PERIOD_S, PAPER) for x in (y, late(y, 90.0)))
-    assert here is not None
-    assert there is not None
     assert there.form.axis == here.form.axis == form
     assert there.evidence.told
     assert there.form.exponent == pytest.approx(1.1, abs=0.03)
@@ -110,26 +103,21 @@ def test_a_power_that_is_late_on_ramps_has_the_same_form(form) -> None:
 def test_a_form_that_is_given_is_kept_and_contradicted_where_it_is_wrong() -> None:
     v, p, y, spans = unit(OPENING, 'bent', 1)
     wrong = find_form(v, p, y, spans, PERIOD_S, PAPER, held=StaticForm())
-    assert wrong is not None
     assert wrong.form == StaticForm()
     assert wrong.evidence.contradicted
     assert not wrong.evidence.told
     right = find_form(v, p, y, spans, PERIOD_S, PAPER, held=StaticForm(OPENING, 1.0))
-    assert right is not None
     assert right.form == StaticForm(OPENING, 1.0)
     assert not right.evidence.contradicted
     asked = find_form(v, p, y, spans, PERIOD_S, PAPER, axis=INTEGRATED_INPUT)
-    assert asked is not None
     assert asked.form == StaticForm()
 
 
 @pytest.mark.parametrize('form', [OPENING, INTEGRATED_INPUT])
-@pytest.mark.parametrize('factor', [0.1, 7.3, 30.0])
+@pytest.mark.parametrize('factor', [0.1, 30.0])
 def test_the_unit_of_pressure_changes_no_exponent_and_scales_the_rest(form, factor) -> None:
     v, p, y, spans = unit(form, 'smooth', 2, exponent=1.07)
     one, other = (find_form(v, f * p, y, spans, PERIOD_S, PAPER) for f in (1.0, factor))
-    assert one is not None
-    assert other is not None
     assert other.form == one.form
     assert other.offset_mw == pytest.approx(one.offset_mw, abs=0.02)
     assert other.evidence.rmse_mw == pytest.approx(one.evidence.rmse_mw)
@@ -139,25 +127,21 @@ def test_the_unit_of_power_missing_values_and_the_order_of_segments_change_nothi
     v, p, y, spans = unit(OPENING, 'bent', 5)
     found = find_form(v, p, y, spans, PERIOD_S, PAPER)
     scaled = find_form(v, p, 3.0 * y, spans, PERIOD_S, PAPER)
-    assert found is not None
-    assert scaled is not None
     assert scaled.form.exponent == pytest.approx(found.form.exponent, abs=4e-3)
     assert scaled.evidence.rmse_mw == pytest.approx(3.0 * found.evidence.rmse_mw, rel=0.02)
     assert scaled.offset_mw == pytest.approx(3.0 * found.offset_mw, abs=0.5)
     y[::17] = np.nan
     holed = find_form(v, p, y, spans, PERIOD_S, PAPER)
-    assert holed is not None
     assert holed.form.exponent == pytest.approx(found.form.exponent, abs=0.02)
 
 
-@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('seed', range(3))
 def test_two_hours_that_visit_the_range_tell_the_form(seed) -> None:
     """A day of a healthy unit may have no more: without the form its curve was 20 MW off."""
     for form in (OPENING, INTEGRATED_INPUT):
         v, p, y, spans = unit(form, 'bent', seed)
         few = np.column_stack([spans[:12, 0], spans[:12, 0] + PER_HOUR // 6])
         found = find_form(v, p, y, few, PERIOD_S, PAPER)
-        assert found is not None
         assert found.form.axis == form or not found.evidence.told
 
 
@@ -171,7 +155,6 @@ def test_too_few_means_tell_no_form_and_cannot_be_put_into_one() -> None:
         with pytest.raises(TooFewSamplesError, match='numbers of'):
             find_form(v, p, y, few, PERIOD_S, PAPER, held=StaticForm(OPENING, 1.0))
         given = find_form(v, p, y, few, PERIOD_S, PAPER, held=StaticForm(exponent=1.0))
-        assert given is not None
         assert (given.form, given.evidence) == (StaticForm(exponent=1.0), None)
 
 
@@ -179,26 +162,22 @@ def test_what_is_known_of_the_form_stays_until_data_tell_of_another() -> None:
     known = StaticForm(OPENING, 1.07)
     v, p, y, spans = unit(OPENING, 'bent', 2, slides=False)
     calm = find_form(v, p, y, spans, PERIOD_S, PAPER, known=known)
-    assert calm is not None
     assert calm.form == known, 'a calm day tells nothing of it'
     v, p, y, spans = unit(OPENING, 'bent', 2, exponent=1.0)
     moved = find_form(v, p, y, spans, PERIOD_S, PAPER, known=known)
-    assert moved is not None
     assert moved.form.exponent == pytest.approx(1.0, abs=0.02)
     v, p, y, spans = unit(INTEGRATED_INPUT, 'bent', 2)
     other = find_form(v, p, y, spans, PERIOD_S, PAPER, known=known)
-    assert other is not None
     assert other.form.axis == INTEGRATED_INPUT
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 def test_what_a_curve_gets_wrong_is_told_with_its_place(seed) -> None:
     v, p, y, spans = unit(OPENING, 'bent', seed)
     right = p * np.interp(v, *TABLES['bent']) - 9.0
     assert find_misfit(v, p, y - right, y, spans, PERIOD_S) is None
     wrong = right + np.where((v > 60.0) & (p > 14.0), 12.0, 0.0)
     found = find_misfit(v, p, y - wrong, y, spans, PERIOD_S)
-    assert found is not None
     opening, pressure, most = found.worst
     assert opening > 60.0
     assert pressure > 14.0
@@ -207,7 +186,6 @@ def test_what_a_curve_gets_wrong_is_told_with_its_place(seed) -> None:
     low, high = np.quantile(v, (0.68, 0.82))
     here = right + np.where((v > low) & (v < high) & (p > np.median(p)), 10.0, 0.0)
     found = find_misfit(v, p, y - here, y, spans, PERIOD_S)
-    assert found is not None
     assert low < found.worst[0] < high
     # What comes once and never again is no fault of the curve.
     once = np.where(np.arange(len(y)) < 400, 15.0, 0.0)

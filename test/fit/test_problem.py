@@ -16,7 +16,6 @@ from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit import problem as module
 from valveflow_ros.fit import whitening
 from valveflow_ros.fit.problem import Problem, Samples, within_bounds
-from valveflow_ros.fit.uncertainty import covariance_of
 from valveflow_ros.fit.whitening import normal_equations
 
 seeds = st.integers(0, 2**32 - 1)
@@ -97,43 +96,6 @@ def test_means_of_the_response_are_the_slow_ones(model, seed, group, scaled):
 
 
 # --- derivatives ----------------------------------------------------------------------------
-
-
-def by_differences(problem, model, column):
-    """Return the derivative of the mean answers by one packed parameter.
-
-    The answers are piecewise smooth: where a sample changes its piece, its region or its
-    whole step of delay the two sides differ, and only where they agree is there a derivative.
-    """
-    h = 1e-5 * max(1.0, abs(model.pack()[column]))
-    sides = []
-    for sign in (-1.0, 1.0):
-        packed = model.pack()
-        packed[column] += sign * h
-        moved, _ = problem.answer(model.unpack(packed))
-        here, weight = problem.answer(model)
-        sides.append(np.where(weight > 0, sign * (here - moved) / h, np.nan))
-    smooth = np.abs(sides[0] - sides[1]) < 2e-4 * (1.0 + np.abs(sides[0]))
-    return 0.5 * (sides[0] + sides[1]), smooth
-
-
-@examples(30)
-@given(models(most_regions=1, kinks=False), st.integers(0, 2**32 - 1), st.sampled_from([1, 5]))
-def test_the_tangents_of_one_region_are_the_differences(model, seed, group):
-    """With one region nothing flips but pieces, and those differ by a kink only."""
-    u, usable = inputs(model, seed), gaps(seed, 300)
-    problem = Problem(samples_of(u, np.zeros(300), usable, group=group))
-    residual, jacobian, weight = problem.tangents(model)
-    assert np.array_equal(weight, problem.answer(model)[1])
-    assert residual == pytest.approx(problem.answer(model)[0], abs=1e-9)
-    share = []
-    for column in range(jacobian.shape[1]):
-        expected, smooth = by_differences(problem, model, column)
-        rows = (weight > 0) & smooth
-        share.append(rows.sum() / max(1, (weight > 0).sum()))
-        # Rows count as smooth while their two sides differ by less than 1e-3.
-        assert jacobian[rows, column] == pytest.approx(expected[rows], rel=2e-3, abs=1e-3)
-    assert np.median(share) > 0.8
 
 
 @examples(10)
@@ -230,32 +192,6 @@ def test_where_no_mean_counts_nothing_is_scored(n, usable, means):
     assert jacobian.shape == (means, 4)
     assert residual.tolist() == weight.tolist() == [0.0] * means
     assert problem.cost(model, np.zeros(4)) == 0.0
-
-
-def test_a_gain_answers_each_model_once_and_is_that_of_the_innovations(monkeypatch):
-    samples, model = plant(np.random.default_rng(3))
-    problem = Problem(samples)
-    small = replace(model, levels=np.empty(0), time_constants=np.ones(1), delays=np.zeros(1))
-    costs = []
-    for one in (small, model):
-        e = whitening.whitened(*problem.answer(one), AR)
-        costs.append(float((e * e).sum()))
-    answered, answer = [], Problem.answer
-    monkeypatch.setattr(Problem, 'answer', lambda self, m: answered.append(m) or answer(self, m))
-    expected = 0.5 * len(e) * np.log(costs[0] / costs[1])
-    assert problem.gain(small, model, AR) == pytest.approx(expected, rel=1e-9)
-    assert len(answered) == 2
-
-
-def test_the_error_of_the_prediction_is_that_of_the_final_fit_only():
-    samples, model = plant(np.random.default_rng(3))
-    free = module.free_parameters(model)
-    errors = [
-        covariance_of(Problem(samples), model, free, AR, final=final).prediction_mw
-        for final in (True, False)
-    ]
-    assert errors[0] > 0.0
-    assert np.isnan(errors[1])
 
 
 @given(seeds)

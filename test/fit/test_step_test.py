@@ -69,13 +69,6 @@ def test_held_openings_are_found_where_they_are(openings, lengths, noise):
     assert holds(signal, 1, 3) == list(zip([0, *ends[:-1]], ends, strict=True))
 
 
-def test_a_gap_ends_a_level_and_a_move_is_none():
-    signal = np.full(100, 50.0)
-    signal[40:43] = math.nan
-    assert holds(signal, 1, 3) == [(0, 40), (43, 100)]
-    assert holds(np.linspace(20.0, 80.0, 100), 1, 5) == []
-
-
 @pytest.mark.skipif(INTERPRETED, reason='days of data need the compiled engine')
 def test_a_test_is_told_from_ordinary_operation():
     for seed in (1, 2):
@@ -126,15 +119,6 @@ def test_few_levels_are_joined_with_those_that_do_not_rise(seed, n):
     assert np.sum(kept * points.power_mw) == pytest.approx(np.sum(weight * raw.power_mw))
     rising = replace(raw, power_mw=np.sort(raw.power_mw) + 0.1 * np.arange(n))
     assert pooled(rising, 1.0)[1] == [1] * n
-
-
-def test_the_same_opening_visited_twice_is_one_level():
-    both = Points(np.array([10.0, 20.0, 30.0, 20.1]), np.array([1.0, 2.0, 3.0, 2.2]), np.ones(4))
-    points, members = pooled(both, 1.0)
-    assert points.u == pytest.approx([10.0, 20.05, 30.0])
-    assert points.power_mw == pytest.approx([1.0, 2.1, 3.0])
-    assert points.error_mw[1] == pytest.approx(math.sqrt(0.5))
-    assert members == [1, 2, 1]
 
 
 @pytest.mark.parametrize('knees', [[], [1300.0], [1300.0, 1700.0]])

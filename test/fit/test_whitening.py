@@ -88,15 +88,6 @@ def test_the_coefficients_are_found_and_the_rest_is_white(true):
         assert abs(np.corrcoef(rest[k:], rest[:-k])[0, 1]) < 0.03
 
 
-@examples(30)
-@given(seeds, st.sampled_from([1e-3, 4.0, 1e6]))
-def test_the_coefficients_do_not_depend_on_the_scale(seed, factor):
-    rng = np.random.default_rng(seed)
-    x, w = coloured(rng, 300, [0.6]), weights(rng, 300)
-    assert fit_ar(factor * x, w) == pytest.approx(fit_ar(x, w), abs=1e-9)
-    assert inflation(factor * x, w, 20) == pytest.approx(inflation(x, w, 20), rel=1e-9)
-
-
 @needs_jit
 def test_white_noise_is_not_inflated_and_correlated_noise_as_theory_says():
     rng = np.random.default_rng(3)
@@ -152,16 +143,3 @@ def test_normal_equations_are_the_products_of_whitened_columns(seed, rows, colum
     assert scores.shape == (blocks, columns)
     assert scores.sum(axis=0) == pytest.approx(sums[:-1, -1], abs=1e-9)
     assert square_sum(residual, weight, ar) == pytest.approx((sums[-1, -1], count), abs=1e-9)
-
-
-def test_a_block_of_scores_holds_the_rows_of_its_time():
-    residual = np.arange(12.0)
-    weight = np.ones(12, dtype=np.uint8)
-    table = np.ones((12, 1))
-    _, scores, _ = normal_equations(table, residual, weight, np.empty(0), 3)
-    assert scores[:, 0].tolist() == [0 + 1 + 2 + 3, 4 + 5 + 6 + 7, 8 + 9 + 10 + 11]
-
-
-def test_yule_walker_says_where_there_is_no_one_solution():
-    with pytest.raises(np.linalg.LinAlgError):
-        yule_walker(np.ones(3))
