@@ -126,20 +126,6 @@ def test_json_and_back_is_the_same_to_the_last_bit(c, dynamic):
     assert back.with_id().model_id == c.model_id
 
 
-def test_the_contracts_keys_are_there():
-    raw = to_json(curve([0.0, 1.0, 2.0], [1.0, 2.0], dynamics=DYNAMICS).with_id())
-    assert (raw['format'], raw['version'], raw['optimal']) == ('valveflow/characteristic', 2, True)
-    assert {'u_from', 'u_to', 'slope', 'intercept', 'slope_stderr', 'intercept_stderr',
-            'samples'} <= set(raw['pieces'][0])  # fmt: skip
-    assert len(raw['breakpoint_intervals']) == 1
-    assert set(raw['selection']) >= {'rule', 'cost', 'turning_angle'}
-    assert set(raw['selection']['cost']) == {'1', '2'}
-    assert set(raw['segments']) == {'steady', 'slope_response', 'samples'}
-    assert set(raw['dynamics'][0]) >= {'power_from', 'power_to', 'time_constant_s', 'delay_s'}
-    assert raw['axis'] == 'integrated_input'
-    assert (raw['pressure_scale_exponent'], raw['offset_mw']) == (0.0, 0.0)
-
-
 GOOD = to_json(curve([0.0, 10.0, 20.0], [1.0, 2.0], dynamics=DYNAMICS).with_id())
 
 

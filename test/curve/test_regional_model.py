@@ -35,16 +35,6 @@ def test_an_infinite_input_is_answered_without_a_warning(last, end):
     np.testing.assert_array_equal(model.static(u), [-np.inf, end, np.nan])
 
 
-@examples(60)
-@given(models())
-def test_packing_and_unpacking_gives_the_same_model(model):
-    back = model.unpack(model.pack())
-    for name in ('knots', 'left', 'right', 'levels', 'time_constants', 'delays'):
-        assert getattr(back, name) == pytest.approx(getattr(model, name), rel=1e-12, abs=1e-12)
-    assert len(model.pack()) == 3 * model.pieces - 1 + 2 * model.regions
-    assert (back.pieces, back.regions) == (model.pieces, model.regions)
-
-
 # --- the response ---------------------------------------------------------------------------
 
 

@@ -133,17 +133,3 @@ def test_dropouts_take_values_away_and_change_none():
         np.testing.assert_array_equal(minutes[name][full], whole_minutes[name][full])
     missing = [np.isnan(columns[name]) for name in NAMES]
     assert not np.array_equal(missing[0], missing[1]), 'each signal drops out by itself'
-
-
-def test_after_a_dropout_the_first_scan_is_kept():
-    column = np.zeros(400)
-    column[100:200] = np.nan
-    kept = np.flatnonzero(exceptions(column, 10, 3, 1.0, 600))
-    assert kept.tolist() == [3, 203]
-
-
-def test_a_historian_is_read_from_its_text():
-    assert Historian.parse('minute') == Historian('minute')
-    assert Historian.parse(' compressed: band_percent=1, longest_s=300') == Historian(
-        'compressed', band_percent=1.0, longest_s=300.0
-    )
