@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from naive_stream import NaiveAligner
 from streams import START_NS, blocks_of, cuts, examples, needs_jit
@@ -16,7 +16,6 @@ from valveflow_ros.records import (
     SIGNALS,
     Readings,
     SampleTable,
-    Signal,
     table_to_readings,
 )
 from valveflow_ros.signals.align import REASONS, Aligner
@@ -168,28 +167,6 @@ def test_a_table_on_the_grid_comes_back_as_it_was(n, seed):
 # --- hostile --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('n', [0, 1])
-def test_nothing_and_one_reading(n):
-    table, aligner = run(Settings(), [(START_NS, 0, 50.0, 0)] * n)
-    assert table.values[:, 0].tolist() == [50.0] * n
-    assert np.isnan(table.values[:, 1:]).all()
-    assert sum(sum(c.values()) for c in aligner.counts().values()) == n
-
-
-@pytest.mark.parametrize('wrong', WRONG)
-@pytest.mark.parametrize('signal', list(Signal))
-def test_an_unusable_value_is_counted_and_the_last_good_one_held(signal, wrong):
-    rows = steady_stream(20, (0.0,) * 5, signals=(4, 0, 1, 2, 3))
-    rows = [(t, s, wrong if s == signal and k > 40 else v, q)
-            for k, (t, s, v, q) in enumerate(rows)]  # fmt: skip
-    table, aligner = run(Settings(), rows)
-    reason = 'not_finite' if not np.isfinite(wrong) else 'impossible'
-    assert aligner.counts()[SIGNALS[signal].topic][reason] == sum(
-        s == signal and k > 40 for k, (_, s, _, _) in enumerate(rows)
-    )
-    assert np.isfinite(table.column(signal)[:18]).all()
-
-
 STRANGE = [-(2**63), -(2**63) + 1, -1, 0, 1, 2**62, 2**63 - 1]
 
 
@@ -216,16 +193,6 @@ def test_a_strange_stamp_later_is_an_outlier(stamp):
     assert aligner.counts()['valve_opening']['time_outlier'] == 1
 
 
-@pytest.mark.parametrize('period', [0.1, 60.0])
-def test_other_periods(period):
-    values = {'sample_period': period, 'hold_limit': 5 * period, 'alarm_average': 300.0,
-              'block': max(10.0, period), 'longest_segment': 1800.0}  # fmt: skip
-    table, _ = run(Settings(values), steady_stream(40, (0.0,) * 4, period))
-    assert len(table) == 40
-    assert np.all(np.diff(table.time_ns) == round(period * NS_PER_S))
-    assert np.isfinite(table.values[:, :4]).all()
-
-
 def test_read_only_arrays_are_read():
     rows = Readings.of(steady_stream(10))
     for array in (rows.time_ns, rows.signal, rows.value, rows.quality):
@@ -241,19 +208,3 @@ def test_more_rows_than_one_call_has_room_for():
     table = Aligner(Settings({'sample_period': 1.0})).feed(rows).table
     assert len(table) == 69_996
     assert np.all(np.diff(table.time_ns) == NS_PER_S)
-
-
-@example(0.0)
-@examples(10)
-@given(st.sampled_from([0.0, 0.5, 2.0]))
-def test_a_row_waits_no_longer_than_the_lateness(lateness):
-    """One topic alone closes rows once it is ``lateness`` past them."""
-    settings = Settings({'lateness': lateness})
-    aligner = Aligner(settings)
-    for k in range(20):
-        aligned = aligner.feed(Readings.of([(START_NS + k * NS_PER_S, 0, 50.0, 0)]))
-        newest = START_NS + k * NS_PER_S
-        expected = [newest - round(lateness) * NS_PER_S] if k >= lateness else []
-        if lateness in (0.0, 2.0):
-            assert aligned.table.time_ns.tolist() == expected
-        assert all(t <= newest - lateness * NS_PER_S for t in aligned.table.time_ns.tolist())

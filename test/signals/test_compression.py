@@ -56,7 +56,7 @@ def recorded(seed: int, historian: Historian, **other: np.ndarray) -> Readings:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3, 11, 12])
+@pytest.mark.parametrize('seed', [1, 11])
 @pytest.mark.parametrize(
     ('kept', 'longest_s'),
     [('compressed', 600), ('compressed:band_percent=0.3,longest_s=900,dropouts_per_day=6', 900)],
@@ -83,14 +83,14 @@ def test_rows_that_repeat_the_values_are_told_too() -> None:
     assert (found.own_times, found.step_s) == (False, 10.0)
 
 
-@pytest.mark.parametrize('seed', [1, 2, 11])
+@pytest.mark.parametrize('seed', [1, 11])
 @pytest.mark.parametrize('kept', ['1s', '1s:dropouts_per_day=20', 'minute'])
 def test_an_ordinary_log_is_not_taken_for_one(seed: int, kept: str) -> None:
     """Every second, or means of a minute, with gaps or without."""
     assert find_compression(recorded(seed, Historian.parse(kept))) is None
 
 
-@pytest.mark.parametrize('seed', [1, 2, 11])
+@pytest.mark.parametrize('seed', [1, 11])
 def test_rows_missing_at_random_are_no_compression(seed: int) -> None:
     """Irregular gaps alone do not tell: small changes are there."""
     whole = recorded(seed, Historian('1s'))

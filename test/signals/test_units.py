@@ -99,11 +99,6 @@ def test_u_is_opening_times_pressure_to_the_exponent(opening, pressure, exponent
     assert twice == pytest.approx(2.0 * u)
 
 
-@pytest.mark.parametrize('pressure', [0.0, -0.0, -1.0, float('nan'), -float('inf')])
-def test_without_pressure_there_is_no_u(pressure):
-    assert np.isnan(integrated_input(np.array([50.0]), np.array([pressure])))
-
-
 def test_an_infinite_input_gives_no_finite_u():
     assert not np.isfinite(integrated_input(np.array([np.inf]), np.array([10.0])))
     assert not np.isfinite(integrated_input(np.array([50.0]), np.array([np.inf])))
