@@ -119,7 +119,9 @@ def test_a_valve_at_its_stop_is_no_dead_transmitter(samples: SampleTable, level)
     assert [f.name for f in found] == ['flatline']
 
 
-@pytest.mark.parametrize('effect', [(), ('backlash:w_percent=1',)])
+@pytest.mark.parametrize(
+    'effect', [(), pytest.param(('backlash:w_percent=1',), marks=pytest.mark.long)]
+)
 def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]) -> None:
     """A slack is found with an interval that holds the truth, or cannot be judged."""
     plant = vf.simulate(5, 2, effect, unit='choked_fixed:number=2', recording='minute')
@@ -136,6 +138,7 @@ def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]
     assert any('may come from that' in note for note in found.notes)
 
 
+@pytest.mark.long
 def test_the_size_of_a_temperature_effect_beside_unlogged_weather_holds_the_truth() -> None:
     """A condenser that is not in the log agrees a little with the temperature."""
     unit = 'choked:number=1401'
@@ -159,7 +162,8 @@ def test_a_lag_that_its_error_exceeds_is_not_told() -> None:
 @pytest.mark.parametrize(
     ('unit', 'true'),
     [('choked_fixed:number=5008', {'vacuum'}),
-     ('integrated_input_fixed:number=5012', {'vacuum', 'exponent'})],
+     pytest.param('integrated_input_fixed:number=5012', {'vacuum', 'exponent'},
+                  marks=pytest.mark.long)],
 )  # fmt: skip
 def test_the_rounded_curve_of_a_healthy_unit_is_no_cause(unit: str, true: set[str]) -> None:
     """Its law has another exponent than the paper's, which is true, and it follows the vacuum."""
