@@ -157,7 +157,7 @@ def test_a_change_the_reference_was_made_of_is_no_shift():
 def test_calm_plants_are_hardly_ever_blamed():
     """The curves agree; the segments scatter, and neighbours are correlated."""
     blamed = 0
-    for seed in range(80):
+    for seed in range(40):
         segments = history(seed, count=200)
         wander = np.random.default_rng(seed).normal(0.0, 0.5, 50).repeat(4)
         segments = [
@@ -165,7 +165,7 @@ def test_calm_plants_are_hardly_ever_blamed():
             for s, w in zip(segments, wander, strict=True)
         ]
         blamed += judge_shift(REFERENCE, curve_of(), segments).moved
-    assert blamed <= 2
+    assert blamed <= 1
 
 
 def test_ramps_are_taken_with_their_lag():

@@ -65,7 +65,7 @@ def deviations(result, true=TRUE):
     return (off / np.where(error > 0.0, error, 1.0))[result.free]
 
 
-SEEDS = range(6)
+SEEDS = range(4)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
@@ -85,10 +85,9 @@ def test_the_standard_errors_are_neither_boast_nor_excuse():
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.7
 
 
-@pytest.mark.parametrize('seed', [0, 1])
-def test_what_is_left_is_white_and_as_large_as_the_noise(seed):
-    result = refined(seed)
-    residual, weight = Problem(measured(TRUE, seed).finer()).answer(result.model)
+def test_what_is_left_is_white_and_as_large_as_the_noise():
+    result = refined(0)
+    residual, weight = Problem(measured(TRUE, 0).finer()).answer(result.model)
     e = whitened(residual, weight, result.ar)[:, 0]
     assert result.innovation_mw == pytest.approx(e.std(), rel=0.02)
     assert e.std() < residual[weight > 0].std()
@@ -116,9 +115,8 @@ def test_without_noise_it_is_exact():
             [1000.0, 1100.0, 1290.0, 1450.0, 1610.0, 1800.0, 2000.0],
             [100.0, 125.0, 170.0, 195.0, 220.0, 230.0, 240.0],
         ),
-        straight([1000.0, 1310.0, 1590.0, 1900.0, 2000.0], [100.0, 172.0, 220.0, 235.0, 240.0]),
     ],
-    ids=['three', 'six', 'four'],
+    ids=['three', 'six'],
 )
 def test_the_number_of_pieces_is_found_from_enough_and_too_many(start):
     result = refine(measured(TRUE, 2), start, most_pieces=8)
@@ -137,7 +135,7 @@ def test_a_straight_valve_stays_one_piece_and_one_region():
         np.array([1000.0, 2000.0]), np.array([100.0]), np.array([240.0]), np.empty(0),
         np.array([12.0]), np.array([4.0]),
     )  # fmt: skip
-    for seed in range(3):
+    for seed in range(2):
         result = refine(measured(true, seed), straight([1000.0, 2000.0], [100.0, 240.0]), 8)
         assert (result.model.pieces, result.model.regions) == (1, 1)
         assert np.abs(deviations(result, true)).max() < 4.5
@@ -169,8 +167,7 @@ def test_no_jump_is_found_where_there_is_none():
     assert not refined(0).free[2 * 3 : 2 * 3 + 2].any()
 
 
-@pytest.mark.parametrize('seed', [1, 2])
-@pytest.mark.parametrize('jump', [8.0, -6.0])
+@pytest.mark.parametrize(('seed', 'jump'), [(1, 8.0), (2, -6.0)])
 def test_a_jump_is_found_where_there_is_one(seed, jump):
     left, right = TRUE.left.copy(), TRUE.right.copy()
     left[1:] += jump
@@ -232,8 +229,7 @@ def wandering(rng, n):
     return u
 
 
-@pytest.mark.parametrize('seed', range(4))
-@pytest.mark.parametrize('share', [0.0005, 0.002])
+@pytest.mark.parametrize(('seed', 'share'), [(0, 0.0005), (1, 0.002)])
 def test_the_noise_is_told_from_the_movement(seed, share):
     rng = np.random.default_rng(seed)
     u = wandering(rng, 100_000)
@@ -318,9 +314,8 @@ def held(seed, n=20000):
     return Samples(v, y, usable, 2.0, 110.0, 5, scale=p, pressure_mpa=p), true
 
 
-@pytest.mark.parametrize('seed', [1, 2])
-def test_what_a_historian_held_hardly_makes_the_plant_slower(seed):
-    rows, true = held(seed)
+def test_what_a_historian_held_hardly_makes_the_plant_slower():
+    rows, true = held(1)
     assert rows.held
     assert not measured(TRUE, 0).held
     start = replace(true, time_constants=np.empty(0), delays=np.empty(0))

@@ -17,7 +17,7 @@ from streams import INTERPRETED, START_NS, examples, grid_ns, table_of
 from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.curve.compensation import compensate
 from valveflow_ros.errors import DataError
-from valveflow_ros.fit.step_levels import holds, long_run_sd, looks_like_step_test
+from valveflow_ros.fit.step_levels import holds, looks_like_step_test
 from valveflow_ros.fit.step_test import (
     ENOUGH,
     RULE,
@@ -85,19 +85,6 @@ def test_a_test_is_told_from_ordinary_operation():
         openings.append(0.9 * openings[-1] + 4.4 + rng.normal(0.0, 0.7))
     wandering = by_hand(openings, 1)
     assert not looks_like_step_test(wandering, Settings({**rows, 'alarm_block': 120.0}))
-
-
-@examples(30)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 0.8]))
-def test_means_of_noise_scatter_as_is_said(seed, phi):
-    """Levels of 50 values each of a noise that remembers, against their own means."""
-    rng = np.random.default_rng(seed)
-    drive = rng.normal(0.0, 1.0, (400, 150))
-    for t in range(1, 150):
-        drive[:, t] += phi * drive[:, t - 1]
-    levels = drive[:, 100:]
-    said = long_run_sd(list(levels)) / math.sqrt(50)
-    assert said == pytest.approx(float(np.std(levels.mean(axis=1))), rel=0.25)
 
 
 # --- the curve through levels -----------------------------------------------------------------

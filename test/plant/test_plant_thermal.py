@@ -90,10 +90,9 @@ def test_units_of_a_kind_are_plausible_and_different(kind):
 
 
 @needs_jit
-@pytest.mark.parametrize('number', [0, 11])
 @pytest.mark.parametrize('kind', KINDS)
-def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(kind, number):
-    log = simulate_thermal(1.0, number, random_unit(kind, number))
+def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(kind):
+    log = simulate_thermal(1.0, 11, random_unit(kind, 11))
     true, error = log.truth, log.demand_mw - log.truth.power
     for column, low, high in (('plug', 5.0, 100.01), ('pressure', 7.0, 18.5), ('power', 125, 338)):
         assert low < getattr(true, column).min() < getattr(true, column).max() < high
