@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 from streams import examples, needs_jit
 
 from valveflow_ros.curve.regional_model import lagged_products
@@ -20,9 +18,7 @@ from valveflow_ros.fit.whitening import (
     inflation,
     normal_equations,
     whitened,
-    yule_walker,
 )
-from valveflow_ros.numerics import running_average
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -109,23 +105,6 @@ def test_a_residual_without_information_gives_finite_numbers(n, value, weight):
     assert np.isfinite(left).all()
     assert len(left) == weight * max(0, n - ORDER)
     assert 1.0 <= inflation(x, w, min(20, n + 1)) < math.inf
-
-
-@examples(40)
-@given(seeds, st.integers(0, 20))
-def test_coefficients_are_those_of_the_toeplitz_system(seed, order):
-    x = coloured(np.random.default_rng(seed), 400, [0.6])
-    products = np.array([x[k:] @ x[: len(x) - k] / len(x) for k in range(order + 1)])
-    expected = solve_toeplitz(products[:-1], products[1:]) if order else np.empty(0)
-    assert yule_walker(products) == pytest.approx(expected, abs=1e-9)
-
-
-@examples(20)
-@given(seeds, st.integers(0, 50), st.floats(0.0, 0.999))
-def test_a_running_average_is_the_filter_of_first_order(seed, n, forget):
-    x = np.random.default_rng(seed).normal(0.0, 1.0, n)
-    expected = lfilter([1.0 - forget], [1.0, -forget], x)
-    assert running_average(x, forget) == pytest.approx(expected, abs=1e-12)
 
 
 @examples(40)

@@ -29,7 +29,6 @@ from valveflow_ros.monitoring.offline import CLOCK_BACK, JournalReplayer, feed_r
 from valveflow_ros.monitoring.reference import MONTH_NS, ReferenceCurve
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SegmentKind, SpecialSegment
-from valveflow_ros.state import from_bytes, to_bytes
 
 # The residual alarm is out of the way: it would stop refits before the curve can move.
 BY_HAND = Settings({**QUICK_MONITOR, 'alarm_limit': 1000.0, 'shift_confidence': 0.99})
@@ -167,20 +166,6 @@ def test_a_fault_that_stays_stands_however_long_it_lasts(added_mw):
 def middle_of(monitor):
     at = np.array([float(np.median(healthy().reference.curve.breakpoints))])
     return monitor.characteristic.model.static(at)[0]
-
-
-def test_a_state_of_before_goes_on():
-    """States of earlier versions have neither regime nor a curve of its own that predicts."""
-    state = from_bytes(to_bytes(healthy().snapshot()))
-    for key in ('times_ns', 'fault_ns', 'first', 'candidate', 'worn'):
-        del state['reference'][key]
-    alarm = state['alarm']
-    del state['force']['predicting'], alarm['span'], alarm['onset_ns']
-    alarm['memory'] = alarm['memory'][:-1]
-    monitor = Monitor(BY_TIME)
-    monitor.restore(state)
-    assert monitor.predicting is not None
-    feed_rows(monitor, after(monitor, 4, 300))
 
 
 # --- the alarm on a shift ---------------------------------------------------------------------

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -18,7 +17,6 @@ from step_plan import StepPlan, step_test
 
 from valveflow_ros.plant import loop
 from valveflow_ros.plant.effect import DAY_S, ActuatorLimits
-from valveflow_ros.plant.loop import lag_coefficients
 from valveflow_ros.plant.plant import Disturbance, LoadProgramme
 from valveflow_ros.plant.simulator import WARM_UP_S, simulate
 from valveflow_ros.plant.spec import EffectSpec
@@ -157,17 +155,6 @@ def test_the_fast_loop_is_the_slow_one(number, faulty):
     np.testing.assert_allclose(log.plug_percent, slow[:, 1], rtol=1e-9)
     np.testing.assert_allclose(log.true_u, slow[:, 2], rtol=1e-9)
     np.testing.assert_allclose(log.true_power_mw, slow[:, 3], rtol=1e-9)
-
-
-@pytest.mark.parametrize('step_s', [0.5, 1.0, 7.0])
-@pytest.mark.parametrize('time_s', [0.5, 80.0])
-def test_a_ramp_is_answered_late_by_its_time_constant(step_s, time_s):
-    a, b, c = lag_coefficients(time_s, step_s)
-    ramp = np.arange(0.0, 20.0 * time_s + 10.0 * step_s, step_s)
-    y = ramp[0]
-    for before, now in itertools.pairwise(ramp):
-        y = a * y + b * before + c * now
-    assert y == pytest.approx(ramp[-1] - time_s, rel=1e-6, abs=1e-6 * time_s)
 
 
 def test_sampling_twice_as_often_gives_the_same_plant():

@@ -109,23 +109,6 @@ def test_a_day_of_a_unit_stays_in_range_and_its_governor_does_not_swing(kind):
 
 
 @needs_jit
-def test_steady_rows_lie_on_the_static_power_to_within_noise():
-    unit = dataclasses.replace(random_unit('sequence', 2), vacuum_per_kpa=0.0)
-    true = simulate_thermal(0.5, 8, unit).truth
-    away = true.power - unit.static_power(true.plug, true.pressure)
-    still = np.abs(true.flow[300:] - true.flow[:-300]) < 0.002
-    assert still.sum() > 1000
-    assert abs(away[300:][still].mean()) < 0.1
-    assert away[300:][still].std() < 1.5
-
-
-def test_steam_is_neither_made_nor_lost():
-    true, unit = quiet_log().truth, QUIET
-    rise = np.diff(true.drum) * unit.storage_s / unit.pressure_rated_mpa
-    np.testing.assert_allclose(rise, true.heat[1:] - true.flow[:-1], atol=1e-12)
-
-
-@needs_jit
 def test_the_condenser_moves_the_power_by_its_share_and_not_at_all_when_switched_off():
     worse, none = quiet_log(days=1.0, vacuum_per_kpa=-0.01), quiet_log(days=1.0)
     shown = worse.extra['condenser_pressure_kpa']
@@ -182,20 +165,6 @@ def test_an_effect_moves_nothing_outside_the_unit(name):
     if name in ('flatline', 'quantisation', 'spikes', 'clock'):
         assert np.flatnonzero(moved).tolist() == [Signal.GENERATED_POWER]
         np.testing.assert_array_equal(log.truth, healthy.truth)
-
-
-def test_slack_friction_stop_and_servo_act_on_their_side_of_the_sensor():
-    true = quiet_log('backlash:w_percent=1.2').truth
-    assert np.abs(true.stem - true.plug).max() == pytest.approx(0.6, abs=1e-9)
-    assert np.ptp(true.stem - true.plug) == pytest.approx(1.2, abs=1e-9)
-    for side, (lowest, most) in enumerate(((0.9, 1.5), (0.0, 0.0))):
-        true = quiet_log(f'stiction:s_percent=2,j_percent=1,before_sensor={side}').truth
-        assert lowest <= np.abs(true.stem - true.plug).max() <= most + 1e-9
-        assert (np.mean(np.diff(true.stem) == 0.0) > 0.05) == (side == 1)
-        assert np.mean(np.diff(true.plug) == 0.0) > 0.05
-    true = quiet_log('saturation:max_percent=60', 'rate_limit:r_percent_per_s=0.1').truth
-    assert true.plug.max() == 60.0
-    assert np.abs(np.diff(true.plug)).max() <= 0.1 + 1e-9
 
 
 def test_wrong_sensors_show_what_they_say():
