@@ -304,3 +304,22 @@ def test_several_pieces_change_where_their_least_squares_say(seed, n, m, share):
     middle, low, high = common_change(pieces, -1)
     if any(0 < np.sum(p.time_ns > at) < len(p) for p in pieces):
         assert edges[best] <= low <= middle <= high <= edges[best + 1]
+
+
+def test_changes_before_the_known_time_are_left_out():
+    pieces = [piece(*series(1, 80, 30, 5.0))]
+    assert common_change(pieces, 60_000) == (0, 0, 0)
+    assert common_change(pieces, 10**9) == (0, 0, 0)
+    assert common_change(pieces, 20_000)[0] == pytest.approx(29_500, abs=600)
+    times = 1000 * np.arange(80, dtype=np.int64)
+    times[30:] += 10**6  # no member for a long time, and the known time is in between
+    middle, low, high = common_change([piece(*series(1, 80, 30, 5.0), times)], 900_000)
+    assert 900_000 <= low <= middle <= high <= times[30]
+
+
+def test_short_and_still_series():
+    assert scan(*series(1, 2 * LEAST_SIDE - 1)) is None
+    assert scan(*series(1, 30), first=27) is None
+    assert scan(np.zeros(20), np.ones(20)).p_value == 1.0
+    only_late = scan(*series(3, 60, 20, 5.0), first=40)
+    assert only_late.place >= 40

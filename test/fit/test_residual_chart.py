@@ -16,6 +16,7 @@ from valveflow_ros.fit.residual_chart import (
     ChartDesign,
     ResidualChart,
     alarms,
+    block_means,
     design_chart,
     limit_for,
     normal_limit,
@@ -177,6 +178,13 @@ def test_hardly_any_clean_rows_still_give_limits():
                          run_length_days=30.0, floor_mw=1.0, curve_error_mw=0.0)  # fmt: skip
         assert min(d.limit) > 3.0
         assert d.innovation_mw > 0.0
+
+
+def test_block_means_leave_thin_blocks_out():
+    residual = np.arange(12.0)
+    weight = np.array([1, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0, 1], dtype=np.uint8)
+    assert block_means(residual, weight, 4) == pytest.approx([1.5, 6.5, math.nan], nan_ok=True)
+    assert block_means(residual[:3], weight[:3], 4).shape == (0,)
 
 
 @examples(30)
