@@ -13,6 +13,7 @@ from streams import examples, needs_jit
 from valveflow_ros.baselines.hammerstein import (
     HammersteinModel,
     fit_hammerstein,
+    knots_to_try,
     tangents,
 )
 from valveflow_ros.errors import TooFewSamplesError
@@ -152,6 +153,21 @@ def test_a_plant_of_its_own_class_is_found(own_class):
     assert np.abs(step_response(model, seconds) - step_response(plant, seconds)).max() < 0.03
     assert len(fitted.tried) == 6
     assert all(1.0 <= mse < 1.1 for *_, mse in fitted.tried)
+
+
+@pytest.mark.parametrize('pieces', [1, 5])
+@pytest.mark.parametrize('kind', ['even', 'levels', 'one'])
+def test_knots_to_try_rise_whatever_the_input(pieces, kind):
+    rng = np.random.default_rng(2)
+    u = {
+        'even': rng.uniform(5.0, 9.0, 500),
+        'levels': rng.choice([5.0, 5.0, 5.0, 9.0], 500),
+        'one': np.append(np.full(499, 5.0), 9.0),
+    }[kind]
+    for knots in knots_to_try(u, pieces):
+        assert len(knots) == pieces + 1
+        assert np.all(np.diff(knots) > 0.0)
+        assert (knots[0], knots[-1]) == (u.min(), u.max())
 
 
 def test_too_little_data_is_refused_in_a_sentence():
