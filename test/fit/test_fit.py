@@ -230,6 +230,14 @@ def test_what_gives_no_curve_is_refused_with_a_sentence(harm, words):
     assert 'nan' not in sentence
 
 
+def test_too_few_samples_are_refused_with_both_numbers():
+    contents = window()
+    few = changed(contents, spans=contents.spans[:1])
+    with pytest.raises(TooFewSamplesError, match=r'45\b.*600') as caught:
+        fit(task(few, STATIC.changed({'min_fit_samples': 600})))
+    assert (caught.value.have, caught.value.need) == (45, 600)
+
+
 @pytest.mark.parametrize('jitter', [0.0, 0.005])
 def test_a_valve_that_stands_still_has_no_characteristic(jitter):
     """The pressure moves u, and the power with it, but that is no property of the valve."""

@@ -85,6 +85,30 @@ def test_a_curve_that_cannot_be_judged_suppresses_until_one_can():
     assert over.state == RETURNED
 
 
+PATIENT = LONG.changed({'alarm_off_delay': 10.0, 'alarm_flood': 60})
+
+
+def returns_after_s(desk, start_s):
+    """Raise the alarm and let it be calm; return how long the calm had to last."""
+    desk.rows([2.0], start_s)
+    (back,) = desk.rows([0.0] * 100, start_s + 1)
+    return (back.time_ns - START_NS) / NS_PER_S - start_s - 1
+
+
+def test_a_residual_that_comes_back_soon_has_to_stay_away_for_longer():
+    desk = Desk(PATIENT)
+    assert [returns_after_s(desk, 101 * k) for k in range(2)] == [10.0, 10.0]  # after 90 s
+    soon, now_s = [], 300
+    for _ in range(6):
+        soon.append(returns_after_s(desk, now_s))
+        now_s += 1 + 100
+        desk = desk.taken_up()
+        desk.residual.shift_time(round(60 * NS_PER_S))
+    assert soon == [10.0, 20.0, 40.0, 80.0, 80.0, 80.0]
+    assert desk.residual.reset(START_NS, 'm') == []
+    assert returns_after_s(desk, now_s) == 10.0
+
+
 def test_a_shift_of_another_size_than_was_told_is_told_again():
     desk = Desk(LONG)
     desk.judge(2.0)
