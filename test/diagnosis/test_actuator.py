@@ -148,3 +148,9 @@ def test_sizes_are_freed_of_the_pull_of_noise(name, truth, start):
         held += [low <= t <= high for (_, low, high), t in zip(found, truth, strict=True)]
         assert [v for v, _, _ in found] == pytest.approx(truth, rel=0.02)
     assert np.mean(held) >= 0.7
+
+
+def test_sizes_need_rows():
+    c, v = obvious(40, 2.0, 1.2, np.inf, 1)
+    assert sized('stiction', c, v, 1.0, (2.0, 1.2)) is None
+    assert sized('saturation', c, v, 1.0, (84.0,)) is None

@@ -18,6 +18,7 @@ from valveflow_ros.fit.whitening import (
     inflation,
     normal_equations,
     whitened,
+    yule_walker,
 )
 
 seeds = st.integers(0, 2**32 - 1)
@@ -122,3 +123,8 @@ def test_normal_equations_are_the_products_of_whitened_columns(seed, rows, colum
     assert scores.shape == (blocks, columns)
     assert scores.sum(axis=0) == pytest.approx(sums[:-1, -1], abs=1e-9)
     assert square_sum(residual, weight, ar) == pytest.approx((sums[-1, -1], count), abs=1e-9)
+
+
+def test_yule_walker_says_where_there_is_no_one_solution():
+    with pytest.raises(np.linalg.LinAlgError):
+        yule_walker(np.ones(3))
