@@ -144,8 +144,8 @@ def test_arrows():
 
 @pytest.mark.parametrize(
     ('rooms', 'known'),
-    [(set(ALLOWED) - {'ros'}, ROS), (set(PURE), WORLDLY)],
-    ids=['only ros knows ROS', 'the method has no clock and no files'],
+    [(set(ALLOWED) - {'ros'}, ROS), (set(PURE), WORLDLY), (set(ALLOWED) - {'opcua'}, {'asyncua'})],
+    ids=['only ros knows ROS', 'the method has no clock and no files', 'asyncua is an extra'],
 )
 def test_nobody_knows_what_is_not_his(rooms, known):
     wrong = [
@@ -158,15 +158,29 @@ def test_nobody_knows_what_is_not_his(rooms, known):
     assert wrong == []
 
 
-def test_only_one_folder_knows_asyncua():
-    """It is an extra under the LGPL: optional, and imported where it is needed alone."""
-    users = {room(p) for p in sources() for _, name in imported(p) if name.startswith('asyncua')}
-    assert users == {'opcua'}
+# Every form that an import can have.
+WRONG = (
+    ('cli/x.py', 'def f():\n    import valveflow_ros.ros.node'),
+    ('cli/x.py', 'from valveflow_ros import ros'),
+    ('cli/x.py', 'from ..ros import node'),
+    ('cli/x.py', 'from importlib import import_module\nimport_module("valveflow_ros.ros")'),
+    ('fit/deep/x.py', 'from ...plant import unit'),
+    ('records.py', 'from valveflow_ros.parameters import TABLE'),
+)
+RIGHT = (
+    ('cli/x.py', 'from valveflow_ros.logs import mcap\nfrom . import table'),
+    ('cli/x.py', 'from valveflow_ros import __version__'),
+    ('fit/deep/x.py', 'from ..problem import Problem'),
+)
+CIRCLES = (
+    ('from valveflow_ros.fit.a import x', True),
+    ('def f():\n    from valveflow_ros.fit import a', True),
+    ('if TYPE_CHECKING:\n    from valveflow_ros.fit.a import x', True),
+    ('from valveflow_ros.curve.c import x', False),
+)
 
 
-@pytest.fixture
-def house(monkeypatch, tmp_path):
-    """A function that writes a file into an empty package."""
+def test_wrong_arrows_and_circles_are_found_and_others_are_not(monkeypatch, tmp_path):
     monkeypatch.setattr(f'{__name__}.HOUSE', tmp_path / PACKAGE)
     monkeypatch.setattr(f'{__name__}.ROOT', tmp_path)
 
@@ -174,59 +188,16 @@ def house(monkeypatch, tmp_path):
         path = tmp_path / PACKAGE / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
+        imported.cache_clear()
         return path
 
-    return write
-
-
-WRONG = (
-    ('cli/x.py', 'from valveflow_ros.ros import node'),
-    ('cli/x.py', 'def f():\n    import valveflow_ros.ros.node'),
-    ('cli/x.py', 'from valveflow_ros import ros'),
-    ('cli/x.py', 'from ..ros import node'),
-    ('cli/x.py', 'from importlib import import_module\nimport_module("valveflow_ros.ros")'),
-    ('fit/x.py', 'from valveflow_ros.plant import unit'),
-    ('fit/x.py', 'from valveflow_ros.monitoring import monitor'),
-    ('fit/a/x.py', 'from ...plant import unit'),
-    ('plant/x.py', 'from valveflow_ros.diagnosis import evidence'),
-    ('diagnosis/x.py', 'from valveflow_ros.plant import unit'),
-    ('logs/x.py', 'from valveflow_ros.parameters import TABLE'),
-    ('records.py', 'from valveflow_ros.parameters import TABLE'),
-)
-RIGHT = (
-    ('cli/x.py', 'from valveflow_ros.logs import mcap\nfrom . import table'),
-    ('cli/x.py', 'from valveflow_ros import __version__'),
-    ('fit/a/x.py', 'from ..problem import Problem'),
-    ('logs/x.py', 'from valveflow_ros.records import Readings'),
-)
-
-
-def test_the_reader_of_arrows_is_right_itself(house):
     for k, (file, text) in enumerate((*WRONG, *RIGHT)):
-        path = house(file.replace('x.py', f'x{k}.py'), text)
+        path = write(file, text)
         assert bool(wrong_arrows(path)) is (k < len(WRONG)), text
-
-
-@pytest.mark.parametrize(
-    ('b', 'caught'),
-    [
-        ('from valveflow_ros.fit.a import x', True),
-        ('def f():\n    from valveflow_ros.fit import a', True),
-        ('if TYPE_CHECKING:\n    from valveflow_ros.fit.a import x', True),
-        ('from valveflow_ros.curve.c import x', False),
-    ],
-)
-def test_the_finder_of_circles_catches(b, caught, house):
-    house('fit/__init__.py', '')
-    house('fit/a.py', 'from valveflow_ros.fit.b import y')
-    house('fit/b.py', b)
-    house('curve/c.py', '')
-    assert bool(circles()) is caught
-
-
-def test_no_name_is_defined_twice_in_a_module():
-    """The first of two functions of one name would never run."""
-    for path in HOUSE.rglob('*.py'):
-        body = ast.parse(path.read_text(encoding='utf-8')).body
-        names = [n.name for n in body if isinstance(n, ast.FunctionDef | ast.ClassDef)]
-        assert len(names) == len(set(names)), path
+        path.write_text('')
+    write('fit/__init__.py', '')
+    write('fit/a.py', 'from valveflow_ros.fit.b import y')
+    write('curve/c.py', '')
+    for text, caught in CIRCLES:
+        write('fit/b.py', text)
+        assert bool(circles()) is caught, text

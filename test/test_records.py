@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import START_NS, examples, grid_ns
 
 from valveflow_ros.records import (
     N_SIGNALS,
-    SIGNALS,
     Quality,
     Readings,
     SampleTable,
@@ -29,7 +27,8 @@ def tables(draw):
     n = draw(st.integers(0, 12))
     columns, quality = {}, {}
     for signal in draw(st.sets(st.sampled_from(list(Signal)))):
-        columns[signal] = np.array(draw(st.lists(value, min_size=n, max_size=n)))
+        kind = draw(st.sampled_from([np.float64, np.float32]))
+        columns[signal] = np.array(draw(st.lists(value, min_size=n, max_size=n)), dtype=kind)
         columns[signal].setflags(write=False)
         if draw(st.booleans()):
             codes = st.lists(st.integers(0, 2), min_size=n, max_size=n)
@@ -38,17 +37,12 @@ def tables(draw):
     return SampleTable.from_columns(grid_ns(n), columns, quality), columns, quality
 
 
-def test_the_signals_stand_in_the_order_of_their_numbers():
-    assert [info.signal for info in SIGNALS] == list(range(N_SIGNALS)) == list(Signal)
-    assert [info.topic for info in SIGNALS if not info.required] == ['valve_command']
-    assert all(info.column.startswith(info.topic) for info in SIGNALS)
-
-
 @examples(80)
 @given(tables())
 def test_a_value_is_bad_exactly_where_it_is_nan(made):
     table, columns, quality = made
     assert table.values.shape == table.quality.shape == (len(table), N_SIGNALS)
+    assert table.values.dtype == np.float64
     assert np.array_equal(table.quality == Quality.BAD, np.isnan(table.values))
     assert not np.isinf(table.values).any()
     for signal in Signal:
@@ -71,11 +65,7 @@ def test_parts_joined_are_the_whole(made, a, b):
     assert np.array_equal(joined.values, table.values, equal_nan=True)
     assert np.array_equal(joined.quality, table.quality)
     assert np.shares_memory(parts[0].values, table.values) or a == 0
-
-
-def test_joining_nothing_gives_an_empty_table():
-    empty = SampleTable.concatenate([])
-    assert (len(empty), empty.values.shape, empty.time_ns.dtype) == (0, (0, N_SIGNALS), np.int64)
+    assert len(SampleTable.concatenate([])) == 0
 
 
 @examples(80)
@@ -103,18 +93,3 @@ def test_readings_from_rows_and_their_parts():
     assert part.value.tolist() == [3.0, 4.0, 5.0, 6.0]
     assert np.shares_memory(part.value, readings.value)
     assert (len(readings), len(Readings.of([]))) == (10, 0)
-
-
-def test_records_do_not_change_and_hold_doubles():
-    columns = {
-        Signal.VALVE_OPENING: np.array([1, 2, 3]),
-        Signal.GENERATED_POWER: np.array([1.5, 2.5, np.nan], dtype=np.float32),
-    }
-    table = SampleTable.from_columns(grid_ns(3), columns)
-    assert table.values.dtype == np.float64
-    assert table.column(Signal.VALVE_OPENING).tolist() == [1.0, 2.0, 3.0]
-    assert table.column(Signal.GENERATED_POWER)[:2].tolist() == [1.5, 2.5]
-    with pytest.raises(AttributeError):
-        table.time_ns = grid_ns(3)
-    with pytest.raises((AttributeError, TypeError)):
-        table.something = 1
