@@ -37,8 +37,6 @@ UNITS = {
 BESIDE = re.compile(r'unit: see (field )?(\w+)')
 ENDINGS = {'_mw': 'MW', '_degc': 'degC', '_per_s': '% MPa^e / s', '_s': 's'}
 
-each_file = pytest.mark.parametrize('path', FILES, ids=lambda p: p.stem)
-
 
 def test_all_are_built():
     """Every file is named in CMakeLists.txt, and no other."""
@@ -48,58 +46,45 @@ def test_all_are_built():
     assert re.findall(r':(srv/\w+\.srv)', text) == ['srv/OperateAlarm.srv']
 
 
-@each_file
-def test_every_line_names_its_unit_and_its_type_fits(path):
+def test_every_line_names_its_unit_and_its_type_fits():
     """A text has no unit, a state is a small number, and only numbers are measured.
 
     Arrays have no bound, because plot tools fail on bounded ones.
     """
-    _, fields, constants = message(path)
-    lines = [line for line in path.read_text().splitlines() if line and not line.startswith('#')]
-    for line in lines:
-        assert re.fullmatch(r'\S+ \w+(=\S+)? +# \[[^\]]+\].*', line), line
-    assert len(lines) == len(fields) + len(constants)
-    names = {name for name, *_ in fields}
-    for name, kind, unit, _ in fields:
-        beside = BESIDE.fullmatch(unit)
-        assert beside[2] in names if beside else unit in UNITS | set(KINDS), name
-        scalar = kind.removesuffix('[]')
-        assert re.fullmatch(KINDS.get(unit, 'float64'), scalar), name
-        ending = next((e for e in ENDINGS if name.endswith(e)), '')
-        assert unit == ENDINGS.get(ending, unit), name
+    for path in FILES:
+        _, fields, constants = message(path)
+        text = path.read_text(encoding='utf-8')
+        lines = [line for line in text.splitlines() if line and not line.startswith('#')]
+        for line in lines:
+            assert re.fullmatch(r'\S+ \w+(=\S+)? +# \[[^\]]+\].*', line), line
+        assert len(lines) == len(fields) + len(constants)
+        names = {name for name, *_ in fields}
+        for name, kind, unit, _ in fields:
+            beside = BESIDE.fullmatch(unit)
+            assert beside[2] in names if beside else unit in UNITS | set(KINDS), name
+            assert re.fullmatch(KINDS.get(unit, 'float64'), kind.removesuffix('[]')), name
+            ending = next((e for e in ENDINGS if name.endswith(e)), '')
+            assert unit == ENDINGS.get(ending, unit), name
+        name, kind, _, meaning = fields[0]
+        if path.stem not in WITHOUT_HEADER:
+            assert (kind, name) == ('std_msgs/Header', 'header')
+            assert re.search('stamp:.*frame_id:', meaning)
 
 
-@each_file
-def test_states_and_what_is_not_known_are_explained(path):
+def test_states_and_what_is_not_known_are_explained():
     """Every number that stands for a state has constants that name all it can be.
 
     The message says somewhere what stands for a number or text that is not there.
     """
-    _, fields, constants = message(path)
-    text = path.read_text(encoding='utf-8')
-    states = [name for name, kind, unit, _ in fields if (kind, unit) == ('uint8', 'state')]
-    assert bool(constants) == bool(states)
-    assert len({name for name, _, _ in constants}) == len(constants)
-    assert all(meaning for _, _, meaning in constants)
-    assert 'NaN' in text or all(kind != 'float64' for _, kind, _, _ in fields)
-    for name, _, _, meaning in fields:
-        assert 'empty:' in meaning or not (name == 'model_id' or name.startswith('not_'))
-
-
-@each_file
-def test_text_form(path):
-    _, fields, _ = message(path)
-    text = path.read_text(encoding='utf-8')
-    assert re.fullmatch(r'# .*[^\n]\n', text, re.S)
-    assert text.isascii()
-    assert '\t' not in text
-    assert max(map(len, text.splitlines())) <= 112
-    name, kind, _, meaning = fields[0]
-    if path.stem in WITHOUT_HEADER:
-        assert 'Header' not in text
-    else:
-        assert (kind, name) == ('std_msgs/Header', 'header')
-        assert re.search('stamp:.*frame_id:', meaning)
+    for path in FILES:
+        _, fields, constants = message(path)
+        states = [name for name, kind, unit, _ in fields if (kind, unit) == ('uint8', 'state')]
+        assert bool(constants) == bool(states), path
+        assert len({name for name, _, _ in constants}) == len(constants)
+        assert all(meaning for _, _, meaning in constants)
+        assert 'NaN' in path.read_text() or all(kind != 'float64' for _, kind, _, _ in fields)
+        for name, _, _, meaning in fields:
+            assert 'empty:' in meaning or not (name == 'model_id' or name.startswith('not_'))
 
 
 def built(module: str, name: str) -> Any:
@@ -126,29 +111,16 @@ def test_the_service_answers_as_a_trigger_does_and_is_built_as_written():
         assert list(half.get_fields_and_field_types()) == [name for _, name in part]
 
 
-@each_file
-def test_each_type_is_built_as_written(path):
+def test_each_type_is_built_as_written():
     """The built class has the fields, constants and no others, and starts empty."""
-    cls = built('valveflow_msgs.msg', path.stem)
-    _, fields, constants = message(path)
-    assert list(cls.get_fields_and_field_types()) == [name for name, *_ in fields]
-    assert {name: getattr(cls, name) for name, _, _ in constants} == {
-        name: int(value) for name, value, _ in constants
-    }
-    assert all(len(getattr(cls(), f[0])) == 0 for f in fields if f[1].endswith('[]'))
-
-
-def test_values_survive_the_wire():
-    """Filled messages come back equal after a round trip through CDR."""
-    cause_type, diagnosis_type = (
-        built('valveflow_msgs.msg', name) for name in ('DiagnosisCause', 'Diagnosis')
-    )
-    serialization = importlib.import_module('rclpy.serialization')
-    cause = cause_type(name='sticking', parameter_names=['width'], parameter_values=[0.5])
-    sent = diagnosis_type(causes=[cause, cause], verdict=diagnosis_type.NAMED)
-    sent.header.frame_id = 'unit 1'
-    data = serialization.serialize_message(sent)
-    assert serialization.deserialize_message(data, diagnosis_type) == sent
+    for path in FILES:
+        cls = built('valveflow_msgs.msg', path.stem)
+        _, fields, constants = message(path)
+        assert list(cls.get_fields_and_field_types()) == [name for name, *_ in fields]
+        assert {name: getattr(cls, name) for name, _, _ in constants} == {
+            name: int(value) for name, value, _ in constants
+        }
+        assert all(len(getattr(cls(), f[0])) == 0 for f in fields if f[1].endswith('[]'))
 
 
 # --- the layouts for Foxglove and PlotJuggler ------------------------------------------------
