@@ -33,15 +33,15 @@ choose_transport()
 def held():
     return [len(os.listdir(f'/proc/self/{what}')) for what in ('task', 'fd')]
 def waited(node, names):
-    end_s = time.monotonic() + float(sys.argv[2])
+    end_s = time.monotonic() + 20.0
     while not names <= set(node.get_node_names()) and time.monotonic() < end_s:
         time.sleep(0.02)
     return sorted(node.get_node_names())
-presence = Presence(['--ros-args', '-r', '__node:=renamed'], count=int(sys.argv[1]))
+presence = Presence(['--ros-args', '-r', '__node:=renamed'], count=5)
 context = presence.settle()
 node = rclpy.create_node('joined', context=context)
 presence.end()
-names = waited(node, {'renamed', *sys.argv[3:]})
+names = waited(node, {'renamed', *sys.argv[1:]})
 after = held()
 node.destroy_node()
 presence.close()
@@ -54,10 +54,10 @@ rclpy.shutdown()
 """
 
 
-def joined(count, *neighbours):
+def joined(*neighbours):
     """Return the names it came to know, whether ROS was still up, and what it holds."""
     done = subprocess.run(
-        [sys.executable, '-c', JOIN, str(count), '20' if neighbours else '0', *neighbours],
+        [sys.executable, '-c', JOIN, *neighbours],
         capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -65,11 +65,10 @@ def joined(count, *neighbours):
     return (*first, *second)
 
 
-@pytest.mark.parametrize('count', [0, 5])
-def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(context, count):
+def test_neighbours_are_known_and_as_little_is_left_as_of_a_plain_start(context):
     neighbour = Node('neighbour', context=context)
     try:
-        names, up, after, plain = joined(count, 'neighbour')
+        names, up, after, plain = joined('neighbour')
     finally:
         neighbour.destroy_node()
     # The one node of ours that is left is the real one, by the name it was given.
@@ -156,24 +155,20 @@ def test_where_one_more_cannot_be_made_those_before_will_do(graph, failing):
     presence.close()
 
 
-@pytest.mark.parametrize(
-    ('middleware', 'environ', 'shown'),
-    [
-        ('rmw_fastrtps_cpp', {}, 5),
-        ('rmw_cyclonedds_cpp', {}, 0),
-        ('rmw_fastrtps_cpp', {'ROS_SECURITY_ENABLE': 'true'}, 0),
-        ('rmw_fastrtps_cpp', {'ROS_SECURITY_ENABLE': 'false'}, 5),
-    ],
-)
-def test_it_shows_itself_only_where_that_helps_and_is_allowed(
-    graph, monkeypatch, middleware, environ, shown
-):
+def test_it_shows_itself_only_where_that_helps_and_is_allowed(graph, monkeypatch):
     name = 'valveflow_ros.ros.domain.get_rmw_implementation_identifier'
-    monkeypatch.setattr(name, lambda: middleware)
-    presence = Presence([], environ=environ)
-    assert len(graph.nodes) == shown
-    assert presence.settle().ok()
-    presence.close()
+    for middleware, environ, shown in (
+        (FAST_DDS, {}, 5),
+        ('rmw_cyclonedds_cpp', {}, 0),
+        (FAST_DDS, {'ROS_SECURITY_ENABLE': 'true'}, 0),
+        (FAST_DDS, {'ROS_SECURITY_ENABLE': 'false'}, 5),
+    ):
+        monkeypatch.setattr(name, lambda middleware=middleware: middleware)
+        graph.nodes.clear()
+        presence = Presence([], environ=environ)
+        assert len(graph.nodes) == shown
+        assert presence.settle().ok()
+        presence.close()
 
 
 @pytest.mark.usefixtures('ros_environment', 'here')
@@ -248,31 +243,21 @@ def chosen(**given):
     return environ
 
 
-@pytest.mark.parametrize('reach', ['LOCALHOST', 'SUBNET'])
-@pytest.mark.parametrize(
-    ('name', 'value'),
-    [
-        *((name, 'SHM') for name in (TRANSPORTS, *PROFILES)),
+def test_who_has_chosen_keeps_the_choice_and_the_reach_stays_as_it_was():
+    for reach in ('', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'):
+        assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: SOCKETS}
+    for reach in ('LOCALHOST', 'SUBNET'):
+        for name in (TRANSPORTS, *PROFILES):
+            given = {name: 'SHM', RANGE: reach}
+            assert chosen(**given) == given
         # Discovery of another kind.
-        *((f'ROS_{name}', '1') for name in ('LOCALHOST_ONLY', 'STATIC_PEERS', 'DISCOVERY_SERVER')),
-    ],
-)
-def test_who_has_chosen_keeps_the_choice(name, value, reach):
-    given = {name: value, RANGE: reach}
-    kept = value == 'SHM' or reach == 'LOCALHOST'
-    assert chosen(**given) == (given if kept else {**given, TRANSPORTS: SOCKETS})
-
-
-@pytest.mark.parametrize('reach', ['LOCALHOST', 'SUBNET', ''])
-def test_another_middleware_is_left_alone(reach):
-    environ = {RANGE: reach}
-    choose_transport(environ, 'rmw_cyclonedds_cpp')
-    assert environ == {RANGE: reach}
-
-
-@pytest.mark.parametrize('reach', ['', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'])
-def test_the_reach_stays_as_it_was(reach):
-    assert chosen(**{RANGE: reach}) == {RANGE: reach, TRANSPORTS: SOCKETS}
+        for name in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'):
+            given = {name: '1', RANGE: reach}
+            more = {} if reach == 'LOCALHOST' else {TRANSPORTS: SOCKETS}
+            assert chosen(**given) == given | more
+        environ = {RANGE: reach}
+        choose_transport(environ, 'rmw_cyclonedds_cpp')
+        assert environ == {RANGE: reach}
 
 
 def test_on_one_host_the_profile_takes_the_place_of_the_limit():

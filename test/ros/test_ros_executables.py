@@ -95,12 +95,11 @@ def test_help_is_a_page_and_its_example_works(context, processes, tmp_path, caps
     ears.destroy_node()
 
 
-@pytest.mark.parametrize('module', ['monitor_main', 'watch_main'])
-def test_help_that_nobody_reads_to_its_end_is_no_accident(module):
+def test_help_that_nobody_reads_to_its_end_is_no_accident():
     """As by ``monitor --help | head -1``: the pipe is closed before a letter is written."""
     reader, writer = os.pipe()
     os.close(reader)
-    words = [sys.executable, '-m', f'valveflow_ros.ros.{module}', '--help']
+    words = [sys.executable, '-m', 'valveflow_ros.ros.monitor_main', '--help']
     with os.fdopen(writer, 'w') as closed:
         ended = subprocess.run(
             words, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=120, check=False
@@ -108,31 +107,25 @@ def test_help_that_nobody_reads_to_its_end_is_no_accident(module):
     assert (ended.returncode, ended.stderr) == (0, '')
 
 
-@pytest.mark.parametrize(
-    ('parser', 'words', 'said'),
-    [
+def test_what_is_no_number_is_refused_in_words(capsys):
+    for parser, words, said in (
         (replay_main.parser, 'x.mcap --rate fast', '--rate must be a number of seconds of the'),
         (replay_main.parser, 'x.mcap --wait nan', "such as --wait 60; 'nan' is not"),
         (watch_main.parser, '--interval 0', "from 0.1 to 3600, such as --interval 5; '0' is"),
         (demo.parser, '--output d --days -1', '--days must be a number of days'),
         (demo.parser, '--output d --seed x', "'x' is no whole number"),
-    ],
-)
-def test_what_is_no_number_is_refused_in_words(parser, words, said, capsys):
-    with pytest.raises(SystemExit) as ended:
-        parser().parse_args(words.split())
-    assert ended.value.code == 2
-    assert said in capsys.readouterr().err
+    ):
+        with pytest.raises(SystemExit) as ended:
+            parser().parse_args(words.split())
+        assert ended.value.code == 2
+        assert said in capsys.readouterr().err
 
 
 NOT_A_FILE = 'cannot be opened (no such file or directory)'
 REFUSED = [
     ('replay', 'missing.mcap', f'missing.mcap: {NOT_A_FILE}.', 1),
-    ('replay', 'missing.mcap --verify', f'missing.mcap: {NOT_A_FILE}', 1),
-    ('replay', 'text.mcap', 'text.mcap: is not an MCAP file.', 1),
     ('replay', 'runs', 'give one of: runs/one, runs/two.', 1),
     ('replay', 'plain.mcap --verify', 'is no recording of the monitor', 1),
-    ('replay', 'plain.mcap --verify', 'The progress is printed from time to time.', 1),
     ('replay', 'plain.mcap --rate -1', 'from 0 to 1000000', 2),
     ('replay', 'plain.mcap --wait 0.2', 'Nobody listened within 0.2 s', 1),
     ('plant_simulator', '--ros-args -p days:=-1.0', "Parameter 'days' must be from", 1),
@@ -142,21 +135,17 @@ REFUSED = [
     ('plant_simulator', '--ros-args -p start:=yesterday', "'start' must be a time such as", 1),
     ('page', '--port TAKEN', 'choose one with --port.', 1),
     ('page', '--port 1 --webhook nowhere', '--webhook must be an address', 1),
-    ('page', "--port 1 --on-alarm ''", '--on-alarm names no command', 1),
     ('page', '--port 1 --token-file /no/such/file', '/no/such/file: cannot be read', 1),
-    ('opcua_gateway', '--ros-args -p mapping_file:=empty', 'keys with values are expected', 1),
     ('opcua_gateway', '--ros-args -p mapping_file:=perod', "did you mean 'period'?", 1),
     ('opcua_gateway', '', 'Name the mapping file', 1),
     ('opcua_gateway', '--ros-args -p mapping_file:=taken', 'cannot be offered: ', 1),
     ('monitor', '--ros-args --params-file negative', "Parameter 'refit_period' must be", 1),
-    ('monitor', '--ros-args --params-file text', "Parameter 'refit_period' must be", 1),
     ('monitor', '--ros-args --params-file number', "Parameter 'unit_tag' must be a text, not 7; "
      "write unit_tag: '7' in a file, -p unit_tag:=\"'7'\" on a command line.", 1),
     ('monitor', '--ros-args --params-file broken', 'ROS could not be started', 1),
 ]  # fmt: skip
 PARAMETERS = {
-    'negative': 'refit_period: -5.0', 'text': 'refit_period: soon', 'number': 'unit_tag: 7',
-    'broken': '[',
+    'negative': 'refit_period: -5.0', 'number': 'unit_tag: 7', 'broken': '[',
 }  # fmt: skip
 
 
@@ -168,7 +157,6 @@ def test_what_cannot_be_done_is_said_in_a_sentence(
     if not there(name):
         pytest.skip(f'{NEEDS[name]} is not installed')
     monkeypatch.chdir(tmp_path)
-    Path('text.mcap').write_text('This is a letter to my grandmother.\n' * 20)
     for run in ('one', 'two'):
         Path('runs', run).mkdir(parents=True)
         Path('runs', run, 'log_0.mcap').touch()
@@ -182,7 +170,6 @@ def test_what_cannot_be_done_is_said_in_a_sentence(
             'endpoint': f'opc.tcp://127.0.0.1:{port}',
             'security': {'policy': 'None', 'allow_unencrypted': True},
         }
-        Path('empty').touch()
         Path('perod').write_text(json.dumps(mapping(1, perod=1)))
         Path('taken').write_text(json.dumps(mapping(1, server=offer)))
         arguments = shlex.split(words.replace('TAKEN', str(port)), posix=True)

@@ -174,17 +174,14 @@ def test_replaying_the_journal_says_the_same_byte_for_byte(live):
         assert said(again) == expected
 
 
-@pytest.mark.parametrize(
-    ('kind', 'words'),
-    [
+def test_what_cannot_be_replayed_is_said():
+    for kind, words in (
         (JournalKind.SET_REFERENCE, 'no curve that could become the reference'),
         (JournalKind.DIAGNOSED, 'never asked for'),
-    ],
-)
-def test_what_cannot_be_replayed_is_said(kind, words):
-    entry = JournalEntry(0, kind, 5, 0, 'x', '')
-    with pytest.raises(DataError, match=words):
-        JournalReplayer(Monitor(SETTINGS), [entry]).feed(TABLE.part(0, 3))
+    ):
+        entry = JournalEntry(0, kind, 5, 0, 'x', '')
+        with pytest.raises(DataError, match=words):
+            JournalReplayer(Monitor(SETTINGS), [entry]).feed(TABLE.part(0, 3))
 
 
 def test_the_cutting_of_the_stream_leaves_no_trace():
@@ -215,16 +212,16 @@ def test_the_messages_follow_reference_and_curve():
     assert outputs.shift is None
 
 
-@pytest.mark.parametrize(('axis', 'units'), [
-    ('integrated_input', ['% MPa^e', 'MW / (% MPa^e)']), (OPENING, ['%', 'MW / (% MPa^s)']),
-])  # fmt: skip
-def test_plain_arrays_say_their_unit(axis, units):
-    curve = example_curve(SETTINGS)
-    object.__setattr__(curve, 'axis', axis)
-    told = list(Outputs('u').of([CurveAdopted(curve)]))
-    for name, unit in zip(('breakpoints', 'slopes'), units, strict=True):
-        (message,) = messages(told, Float64MultiArray, name)
-        assert message.layout.dim[0].label.endswith(f'[{unit}]')
+def test_plain_arrays_say_their_unit():
+    for axis, units in (
+        ('integrated_input', ['% MPa^e', 'MW / (% MPa^e)']), (OPENING, ['%', 'MW / (% MPa^s)']),
+    ):  # fmt: skip
+        curve = example_curve(SETTINGS)
+        object.__setattr__(curve, 'axis', axis)
+        told = list(Outputs('u').of([CurveAdopted(curve)]))
+        for name, unit in zip(('breakpoints', 'slopes'), units, strict=True):
+            (message,) = messages(told, Float64MultiArray, name)
+            assert message.layout.dim[0].label.endswith(f'[{unit}]')
 
 
 def test_what_a_replay_reads_of_the_journal_is_not_told_in_a_zone():

@@ -83,7 +83,7 @@ def hearing(context):
     made.node.destroy_node()
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def server():
     made = OpcUaServer(free_port())
     yield made

@@ -100,7 +100,7 @@ def demanded(monkeypatch, tmp_path, ros_environment):
     del ros_environment
 
     def demand(environment):
-        (tmp_path / 'keys' / 'enclaves').mkdir(parents=True)
+        (tmp_path / 'keys' / 'enclaves').mkdir(parents=True, exist_ok=True)
         for name in ('ENABLE', 'STRATEGY', 'KEYSTORE', 'ENCLAVE_OVERRIDE'):
             monkeypatch.delenv(f'ROS_SECURITY_{name}', raising=False)
         for name, value in environment.items():
@@ -110,18 +110,17 @@ def demanded(monkeypatch, tmp_path, ros_environment):
 
 
 @pytest.mark.usefixtures('here')
-@pytest.mark.parametrize(('main', 'demand'), REFUSED)
-def test_no_start_where_security_is_demanded_and_cannot_be_had(demanded, capfd, main, demand):
-    (name, run, arguments), (environment, words) = main, demand
-    demanded(environment)
-    assert run(arguments) == 1
-    said = capfd.readouterr().err
-    start = f'valveflow {name}: Not started, because security is demanded (ROS_SECURITY_ENABLE): '
-    (line,) = [line for line in said.splitlines() if line.startswith('valveflow')]
-    assert line.startswith(start)
-    assert words in line
-    assert line.endswith('.')
-    assert 'Traceback' not in said
+def test_no_start_where_security_is_demanded_and_cannot_be_had(demanded, capfd):
+    for (name, run, arguments), (environment, words) in REFUSED:
+        demanded(environment)
+        assert run(arguments) == 1
+        said = capfd.readouterr().err
+        start = f'valveflow {name}: Not started, because security is demanded '
+        (line,) = [line for line in said.splitlines() if line.startswith('valveflow')]
+        assert line.startswith(f'{start}(ROS_SECURITY_ENABLE): ')
+        assert words in line
+        assert line.endswith('.')
+        assert 'Traceback' not in said
 
 
 def test_a_middleware_without_security_is_called_by_its_name(demanded):
@@ -150,10 +149,10 @@ def contexts(monkeypatch):
     return made
 
 
-@pytest.mark.parametrize('value', ['', 'False', '0', 'no', 'off'])
-def test_who_demands_nothing_is_let_through(demanded, contexts, value):
-    demanded({ENABLE: value, STRATEGY: 'Permissive'})
-    check_security([])
+def test_who_demands_nothing_is_let_through(demanded, contexts):
+    for value in ('', 'False', '0', 'no', 'off'):
+        demanded({ENABLE: value, STRATEGY: 'Permissive'})
+        check_security([])
     check_security([], {})
     assert not contexts, 'no node has to be tried'
 
@@ -209,47 +208,47 @@ def within(limit_s, work):
         pool.submit(work).result(limit_s)
 
 
-@pytest.mark.parametrize('text', ['a\0b', 'a\nb', 'a\x1b[2Jb', 'x' * 501, 'a\u202eb'])
-def test_a_path_is_one_printable_line(context, text):
+def test_a_path_is_one_printable_line(context):
     names = [row.name for row in TABLE if row.name.endswith(('_directory', '_file', '_tag'))]
-    for name in names:
-        with pytest.raises(ParameterError, match='must be one line of at most 500 printable'):
-            Settings({name: text})
-    overrides = [RosParameter(names[0], value=text)]
-    with pytest.raises(ParameterError) as error:
-        MonitorNode(context=context, parameter_overrides=overrides)
-    assert str(error.value).isprintable()
+    for text in ('a\0b', 'a\nb', 'a\x1b[2Jb', 'x' * 501, 'a\u202eb'):
+        for name in names:
+            with pytest.raises(ParameterError, match='must be one line of at most 500 printable'):
+                Settings({name: text})
+        overrides = [RosParameter(names[0], value=text)]
+        with pytest.raises(ParameterError) as error:
+            MonitorNode(context=context, parameter_overrides=overrides)
+        assert str(error.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    'given',
-    ['{}/file', '{}/file/below', '/proc/nowhere', '/dev/null', '{}/' + 'x' * 300, '{}/round'],
-)
-def test_a_folder_that_cannot_be_made_is_a_sentence_and_the_run_goes_on(tmp_path, given):
+def test_a_folder_that_cannot_be_made_is_a_sentence_and_the_run_goes_on(tmp_path):
     (tmp_path / 'file').touch()
     (tmp_path / 'round').symlink_to(tmp_path / 'round')
-    settings = Settings({'record_directory': given.format(tmp_path)})
-    with pytest.raises(RecordingError) as error:
-        new_folder(settings, 1.7e9)
-    recording = Recording(settings, {}, 1.7e9)
-    assert not recording.on
-    assert recording.problem == str(error.value)
-    assert recording.problem.startswith(given.format(tmp_path))
-    assert recording.problem.endswith('.')
-    recording.write('/a', b'', AT_NS, AT_NS)
-    assert recording.close() is None
+    for given in (
+        f'{tmp_path}/file', f'{tmp_path}/file/below', '/proc/nowhere', '/dev/null',
+        f'{tmp_path}/' + 'x' * 300, f'{tmp_path}/round',
+    ):  # fmt: skip
+        settings = Settings({'record_directory': given})
+        with pytest.raises(RecordingError) as error:
+            new_folder(settings, 1.7e9)
+        recording = Recording(settings, {}, 1.7e9)
+        assert not recording.on
+        assert recording.problem == str(error.value)
+        assert recording.problem.startswith(given)
+        assert recording.problem.endswith('.')
+        recording.write('/a', b'', AT_NS, AT_NS)
+        assert recording.close() is None
 
 
-@pytest.mark.parametrize(
-    'tag', ['../../x', '/etc', '..', '.', '~', 'a/b', 'x' * 500, '$(id)', '*', 'ä/ö', '-rf']
-)
-def test_a_tag_does_not_lead_out_of_the_folder(tmp_path, tag):
+def test_a_tag_does_not_lead_out_of_the_folder(tmp_path):
     home = tmp_path / 'home'
-    made = new_folder(Settings({'record_directory': str(home), 'unit_tag': tag}), 1.7e9)
-    assert made.parent == home
-    assert made.resolve() == made
+    tags = ('../../x', '/etc', '..', '.', '~', 'a/b', 'x' * 500, '$(id)', '*', 'ä/ö', '-rf')
+    for tag in tags:
+        made = new_folder(Settings({'record_directory': str(home), 'unit_tag': tag}), 1.7e9)
+        assert made.parent == home
+        assert made.resolve() == made
+        assert stat.S_IMODE(made.stat().st_mode) == 0o700
     assert list(tmp_path.iterdir()) == [home]
-    assert stat.S_IMODE(made.stat().st_mode) == 0o700
+    assert len(list(home.iterdir())) == len(tags)
 
 
 def test_a_planted_link_is_not_followed(tmp_path):

@@ -83,18 +83,18 @@ def last(supervisor, count):
     return supervisor.texts()
 
 
-@pytest.mark.parametrize('abstract', [False, True])
-def test_ready_status_and_end_reach_the_manager(abstract):
-    with listening(abstract) as supervisor:
-        watchdog = Watchdog(supervisor.environment(usec=10_000_000))
-        watchdog.status('Loading.')
-        watchdog.ready('Listening.')
-        watchdog.stopping('Ending.')
-        assert last(supervisor, 3) == [
-            'STATUS=Loading.',
-            'READY=1\nSTATUS=Listening.\nWATCHDOG=1',
-            'STOPPING=1\nSTATUS=Ending.',
-        ]
+def test_ready_status_and_end_reach_the_manager():
+    for abstract in (False, True):
+        with listening(abstract) as supervisor:
+            watchdog = Watchdog(supervisor.environment(usec=10_000_000))
+            watchdog.status('Loading.')
+            watchdog.ready('Listening.')
+            watchdog.stopping('Ending.')
+            assert last(supervisor, 3) == [
+                'STATUS=Loading.',
+                'READY=1\nSTATUS=Listening.\nWATCHDOG=1',
+                'STOPPING=1\nSTATUS=Ending.',
+            ]
 
 
 def test_pings_come_at_twice_the_rate_asked_for_and_no_faster(supervisor):
@@ -108,31 +108,28 @@ def test_pings_come_at_twice_the_rate_asked_for_and_no_faster(supervisor):
     assert last(supervisor, 4) == ['WATCHDOG=1'] * 4
 
 
-@pytest.mark.parametrize(
-    'environment',
-    [
+def test_no_ping_where_none_is_asked_of_this_process(supervisor):
+    for count, environment in enumerate((
         {},
         {'WATCHDOG_USEC': '0'},
         {'WATCHDOG_USEC': 'soon'},
         {'WATCHDOG_USEC': '9' * 5000},
         {'WATCHDOG_USEC': '1000000', 'WATCHDOG_PID': '1'},
-    ],
-)
-def test_no_ping_where_none_is_asked_of_this_process(supervisor, environment):
-    watchdog = Watchdog({**supervisor.environment(), **environment})
-    watchdog.completed(lambda: pytest.fail('the recorder was asked for nothing'))
-    with watchdog.patient(600.0):
-        pass
-    watchdog.status('Here.')
-    assert last(supervisor, 1) == ['STATUS=Here.']
+    )):  # fmt: skip
+        watchdog = Watchdog({**supervisor.environment(), **environment})
+        watchdog.completed(lambda: pytest.fail('the recorder was asked for nothing'))
+        with watchdog.patient(600.0):
+            pass
+        watchdog.status('Here.')
+        assert last(supervisor, count + 1) == ['STATUS=Here.'] * (count + 1)
 
 
-@pytest.mark.parametrize('address', ['', 'relative/socket', '@', '/nowhere/socket', 'vsock:2:1'])
-def test_silent_and_unharmed_where_nobody_listens(address):
-    watchdog = Watchdog({'NOTIFY_SOCKET': address, 'WATCHDOG_USEC': '1000000'})
-    watchdog.ready('Listening.')
-    watchdog.completed(lambda: WELL)
-    watchdog.stopping('Ending.')
+def test_silent_and_unharmed_where_nobody_listens():
+    for address in ('', 'relative/socket', '@', '/nowhere/socket', 'vsock:2:1'):
+        watchdog = Watchdog({'NOTIFY_SOCKET': address, 'WATCHDOG_USEC': '1000000'})
+        watchdog.ready('Listening.')
+        watchdog.completed(lambda: WELL)
+        watchdog.stopping('Ending.')
     assert Watchdog({'WATCHDOG_USEC': '1000000'}).period_s == 0.0
 
 
@@ -184,9 +181,9 @@ def test_long_work_gets_its_time_and_then_the_old_limit_holds(supervisor):
     ]
 
 
-@pytest.mark.parametrize(
-    ('status', 'lives'),
-    [
+def test_who_counts_as_alive(supervisor):
+    expected = []
+    for status, lives in (
         (None, True),
         (WELL, True),
         (RecorderStatus(RecorderState.RECORDING, stalled_s=0.9), True),
@@ -194,15 +191,13 @@ def test_long_work_gets_its_time_and_then_the_old_limit_holds(supervisor):
         (RecorderStatus(RecorderState.DEGRADED, 'no space left', stalled_s=0.0), True),
         (RecorderStatus(RecorderState.DEGRADED, 'no space left', stalled_s=9.0), False),
         (RecorderStatus(RecorderState.STOPPED, 'the recorder failed'), False),
-    ],
-)
-def test_who_counts_as_alive(status, lives, supervisor):
-    assert recorder_lives(status, 1.0) is lives
-    watchdog = Watchdog(supervisor.environment(usec=10_000_000))
-    watchdog.completed(lambda: status)
-    watchdog.status('After.')
-    said = last(supervisor, 1 + lives)
-    assert said == ['WATCHDOG=1'] * lives + ['STATUS=After.']
+    ):
+        assert recorder_lives(status, 1.0) is lives
+        watchdog = Watchdog(supervisor.environment(usec=10_000_000))
+        watchdog.completed(lambda status=status: status)
+        watchdog.status('After.')
+        expected += ['WATCHDOG=1'] * lives + ['STATUS=After.']
+        assert last(supervisor, len(expected)) == expected
 
 
 @pytest.mark.ros
