@@ -170,38 +170,33 @@ def test_a_webhook_that_hangs_is_left(drip):
         thread.join()
 
 
-@pytest.mark.parametrize(
-    ('line', 'told'),
-    [
-        ('false', 'ended with status 1'),
-        ('/no/such/program', 'No such file'),
-        # A shell and what it starts are both ended.
-        ("sh -c 'sleep 600 & wait'", 'longer than 0.3 s'),
-        (None, 'refused'),
-    ],
-)
-def test_what_cannot_be_delivered_is_told(line, told):
+def test_what_cannot_be_delivered_is_told():
     with socket.create_server(('127.0.0.1', 0)) as free:
         port = free.getsockname()[1]
-    deliver = command(line, limit_s=0.3) if line else webhook(f'http://127.0.0.1:{port}/')
-    begun_s = time.monotonic()
-    with pytest.raises(DeliveryError, match=told):
-        deliver(b'{}')
-    assert time.monotonic() - begun_s < PATIENCE_S
+    for deliver, told in (
+        (command('false'), 'ended with status 1'),
+        (command('/no/such/program'), 'No such file'),
+        # A shell and what it starts are both ended.
+        (command("sh -c 'sleep 600 & wait'", limit_s=0.3), 'longer than 0.3 s'),
+        (webhook(f'http://127.0.0.1:{port}/'), 'refused'),
+    ):
+        begun_s = time.monotonic()
+        with pytest.raises(DeliveryError, match=told):
+            deliver(b'{}')
+        assert time.monotonic() - begun_s < PATIENCE_S
 
 
-@pytest.mark.parametrize(
-    ('make', 'text'),
-    [
-        *((webhook, url) for url in ('', 'host', 'ftp://host/', 'http://', 'http://[1',
-                                     'http://a:99999/', 'http://u:p@h/')),
-        *((command, line) for line in ('', '  ', "an 'open quote")),
-    ],
-)  # fmt: skip
-def test_what_is_no_address_and_no_command_is_refused(make, text):
-    said = '--on-alarm' if make is command else '--webhook must be an address'
-    with pytest.raises(UsageError, match=said):
-        make(text)
+def test_what_is_no_address_and_no_command_is_refused():
+    addresses = ('', 'host', 'ftp://host/', 'http://', 'http://[1', 'http://a:99999/',
+                 'http://u:p@h/')  # fmt: skip
+    lines = ('', '  ', "an 'open quote")
+    for make, said, texts in (
+        (webhook, '--webhook must be an address', addresses),
+        (command, '--on-alarm', lines),
+    ):
+        for text in texts:
+            with pytest.raises(UsageError, match=said):
+                make(text)
 
 
 def test_changes_of_a_unit_reach_the_webhook(hook):

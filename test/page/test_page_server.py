@@ -157,45 +157,33 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize('case', REFUSED)
-def test_what_is_refused(quiet, case, capfd):
-    path, method, head, status = REFUSED[case]
-    found, _, text = asked(quiet, path, method, **head)
-    assert found == status, text
-    assert len(text) < 200
-    assert 'Traceback' not in text + capfd.readouterr().err
-    assert asked(quiet)[0] == 200
-
-
-@pytest.mark.parametrize(
-    'body',
-    ['', '{', '[]', 'null', '"x"', '{"output": 7}', '{"output":"a.b","inputs":[7]}', 'é' * 9],
-)
-def test_garbage_where_a_browser_asks(quiet, body, capfd):
-    status, _, text = asked(
-        quiet, '/_dash-update-component', 'POST', body.encode(), Content_Type='application/json'
-    )
-    assert status == 400
-    assert 'Traceback' not in text + capfd.readouterr().err
-    assert asked(quiet)[0] == 200
-
-
-@pytest.mark.parametrize('seen', [None, 7, {'0': 7}, {'generation': None, '0': {'head': []}}])
-def test_garbage_for_what_was_seen(quiet, seen):
-    assert tick(quiet, seen)[0] == 200
-
-
-@pytest.mark.parametrize(
-    'sent', [b'\0' * 100, b'GET / HTTP/9\r\n\r\n', b'\x16\x03\x01\x02\0\x01', b'GET\r\n\r\n' * 50]
-)
-def test_what_is_not_http(quiet, sent, capfd):
-    with socket.create_connection(('127.0.0.1', quiet.port), timeout=20) as peer:
-        peer.sendall(sent)
-        peer.shutdown(socket.SHUT_WR)
-        answer = peer.recv(65536)
-    assert answer == b'' or b' 40' in answer.split(b'\r\n')[0]
+def test_what_is_refused(quiet, capfd):
+    for what, (path, method, head, status) in REFUSED.items():
+        found, _, text = asked(quiet, path, method, **head)
+        assert (found, what) == (status, what)
+        assert len(text) < 200, what
+        assert 'Traceback' not in text, what
+    for body in ('', '{', '[]', 'null', '"x"', '{"output": 7}', '{"output":"a.b","inputs":[7]}',
+                 'é' * 9):  # fmt: skip
+        status, _, text = asked(
+            quiet, '/_dash-update-component', 'POST', body.encode(),
+            Content_Type='application/json',
+        )  # fmt: skip
+        assert (status, 'Traceback' in text) == (400, False), body
+    for sent in (b'\0' * 100, b'GET / HTTP/9\r\n\r\n', b'\x16\x03\x01\x02\0\x01',
+                 b'GET\r\n\r\n' * 50):  # fmt: skip
+        with socket.create_connection(('127.0.0.1', quiet.port), timeout=20) as peer:
+            peer.sendall(sent)
+            peer.shutdown(socket.SHUT_WR)
+            answer = peer.recv(65536)
+        assert answer == b'' or b' 40' in answer.split(b'\r\n')[0], sent
     assert 'Traceback' not in capfd.readouterr().err
     assert asked(quiet)[0] == 200
+
+
+def test_garbage_for_what_was_seen_does_no_harm(quiet):
+    for seen in (None, 7, {'0': 7}, {'generation': None, '0': {'head': []}}):
+        assert tick(quiet, seen)[0] == 200
 
 
 def test_a_body_without_end_is_refused(quiet):
@@ -207,10 +195,10 @@ def test_a_body_without_end_is_refused(quiet):
         assert b'413' in peer.recv(65536)
 
 
-@pytest.mark.parametrize('name', ['localhost', '127.0.0.1', '[::1]', '10.1.2.3', 'plant.example'])
-def test_our_own_names(quiet, name):
-    host = f'{name}:{quiet.port}'
-    assert asked(quiet, Host=host, Origin=f'http://{host}')[0] == 200
+def test_our_own_names(quiet):
+    for name in ('localhost', '127.0.0.1', '[::1]', '10.1.2.3', 'plant.example'):
+        host = f'{name}:{quiet.port}'
+        assert asked(quiet, Host=host, Origin=f'http://{host}')[0] == 200
 
 
 @pytest.mark.parametrize(
@@ -245,27 +233,27 @@ def test_two_hundred_connections_and_then_too_many(serve):
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize('kind', ['idle', 'half a request', 'drips', 'does not read'])
-def test_slow_peers_are_left(serve, monkeypatch, kind):
+def test_slow_peers_are_left(serve, monkeypatch):
     monkeypatch.setattr(module, 'IDLE_S', 1)
     monkeypatch.setattr(module, '_SWEEP_S', 0.2)
     server = serve(shown_now(told(seconds=3)))
-    with socket.socket() as peer:
-        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        peer.settimeout(20)
-        peer.connect(('127.0.0.1', server.port))
-        line = b'GET / HTTP/1.1\r\nHost: localhost\r\n'
-        if kind == 'does not read':
-            peer.sendall((line + b'\r\n') * 400)
-        elif kind != 'idle':
-            peer.sendall(line)
+    line = b'GET / HTTP/1.1\r\nHost: localhost\r\n'
+    # Idle, half a request, one that drips, and one that does not read.
+    sends = {'idle': b'', 'half': line, 'drips': line, 'deaf': (line + b'\r\n') * 400}
+    with ExitStack() as stack:
+        peers = {}
+        for kind, sent in sends.items():
+            peers[kind] = peer = stack.enter_context(socket.socket())
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            peer.settimeout(20)
+            peer.connect(('127.0.0.1', server.port))
+            peer.sendall(sent)
         assert asked(server)[0] == 200
         deadline_s = time.monotonic() + 20
         while server.connections():
-            assert time.monotonic() < deadline_s, 'it is still connected'
-            if kind == 'drips':
-                with suppress(OSError):
-                    peer.sendall(b'X')
+            assert time.monotonic() < deadline_s, 'some are still connected'
+            with suppress(OSError):
+                peers['drips'].sendall(b'X')
             time.sleep(0.1)
     assert asked(server)[0] == 200
 
@@ -320,14 +308,14 @@ def test_a_token_and_few_wrong_ones():
     assert done == [('/m', 'acknowledge residual')]
 
 
-@pytest.mark.parametrize('content', [b'short\n', b'', b'\xff' * 9])
-def test_the_file_of_the_token(tmp_path, content):
+def test_the_file_of_the_token(tmp_path):
     path = tmp_path / 'token'
     path.write_bytes(b' eight signs \nmore\n')
     assert read_token(path) == 'eight signs'
-    path.write_bytes(content)
-    with pytest.raises((InputError, RecordingError), match='token'):
-        read_token(path)
+    for content in (b'short\n', b'', b'\xff' * 9):
+        path.write_bytes(content)
+        with pytest.raises((InputError, RecordingError), match='token'):
+            read_token(path)
 
 
 def test_without_its_libraries_it_says_what_to_install(monkeypatch):

@@ -85,10 +85,9 @@ def test_alarms_changes_and_units_are_bounded():
     assert len(shown_now(*units).units) == MOST_UNITS
 
 
-@pytest.mark.parametrize('tag', ['U1', ''])
-def test_a_unit_without_a_tag_has_the_name_of_its_monitor(tag):
-    (unit,) = shown_now(told('/m', tag, seconds=1)).units
-    assert unit.title == (tag or '/m')
+def test_a_unit_without_a_tag_has_the_name_of_its_monitor():
+    units = shown_now(told('/m', 'U1', seconds=1), told('/n', '', seconds=1)).units
+    assert [unit.title for unit in units] == ['U1', '/n']
 
 
 # Its metrics.
