@@ -122,15 +122,6 @@ def test_every_page_is_in_the_navigation_of_the_site() -> None:
         assert re.search(rf'[ ]{re.escape(name)}$', navigation, re.M), name
 
 
-def test_pages_are_turned_for_the_site() -> None:
-    text = '[a](../SECURITY.md) [b](../CHANGELOG.rst) [c](page.md)\n```sh jazzy\nls\n```\n'
-    turned = make_site.turned(text, '../')
-    assert turned == '[a](SECURITY.md) [b](CHANGELOG.md) [c](page.md)\n```sh\nls\n```\n'
-    assert '](../' not in make_site.turned((DOCS / 'index.md').read_text(), '../')
-    text = '^^^^\nPart\n^^^^\n\nNext\n----\n* ``a`` is\n  new.\n* b\n'
-    assert make_site.changes(text) == '# Part\n\n## Next\n\n* `a` is\n  new.\n* b\n'
-
-
 def test_the_site_has_the_help_of_every_executable() -> None:
     for module in make_site.EXECUTABLES.values():
         assert (PACKAGE / 'ros' / f'{module}_main.py').exists()

@@ -9,7 +9,6 @@ import json
 import os
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -170,34 +169,11 @@ def plotjuggler() -> ET.Element:
     return ET.parse(CONFIG / 'plotjuggler_layout.xml').getroot()
 
 
-def leaves(node: Any) -> Iterator[str]:
-    if isinstance(node, str):
-        yield node
-        return
-    assert node['direction'] in ('row', 'column')
-    assert 0 < node['splitPercentage'] < 100
-    yield from leaves(node['first'])
-    yield from leaves(node['second'])
-
-
-def test_every_panel_of_foxglove_is_shown_once_and_known(foxglove):
-    shown = list(leaves(foxglove['layout']))
-    panels = foxglove['configById']
-    assert sorted(shown) == sorted(panels)
-    kinds = {'Plot', 'StateTransitions', 'RawMessages', 'DiagnosticSummary', 'Table'}
-    assert {name.split('!')[0] for name in shown} == kinds
-    for panel in panels.values():
-        assert panel['foxglovePanelTitle'] == panel['lichtblickPanelTitle']
-        # A replay has stamps of another day; over those its plots would be empty.
-        assert {p['timestampMethod'] for p in panel.get('paths', ())} <= {'receiveTime'}
-    curve = panels['Plot!curve']
-    assert curve['xAxisVal'] == 'currentCustom'
-    assert curve['xAxisPath']['value'].startswith(f'{NODE}/characteristic.')
-
-
 def test_every_path_of_foxglove_leads_to_a_field(foxglove):
     plotted = set()
     for name, panel in foxglove['configById'].items():
+        # A replay has stamps of another day; over those its plots would be empty.
+        assert {p['timestampMethod'] for p in panel.get('paths', ())} <= {'receiveTime'}
         assert panel.get('topicToRender') in (None, '/diagnostics')
         if panel.get('topicPath'):
             resolved(panel['topicPath'])
@@ -243,11 +219,7 @@ def test_the_script_of_plotjuggler_draws_the_curve_of_the_message(plotjuggler):
             found(topic, field)
 
 
-def test_sizes_and_topics_of_plotjuggler_add_up(plotjuggler):
-    for splitter in plotjuggler.iter('DockSplitter'):
-        sizes = [float(part) for part in splitter.attrib['sizes'].split(';')]
-        assert len(sizes) == int(splitter.attrib['count']) == len(splitter.findall('DockArea'))
-        assert sum(sizes) == pytest.approx(1.0)
+def test_plotjuggler_takes_the_topics_that_it_draws(plotjuggler):
     wanted = ';'.join(f'{NODE}/{topic}' for topic in TYPES)
     plugins = {p.attrib['ID']: p for p in plotjuggler.iter('plugin')}
     assert plugins['DataLoad MCAP'][0].attrib['selected_topics'] == wanted

@@ -3,7 +3,6 @@
 """The node in this process: its life, what it refuses, and what it says meanwhile."""
 
 import os
-import time
 
 import pytest
 import yaml
@@ -168,27 +167,11 @@ def test_an_active_monitor_answers_all_and_tells_what_it_sees(staged, tmp_path, 
     monkeypatch.setattr(monitor_node, '_LOOK_AROUND_S', 0.05)
     stage = staged(main_steam_pressure_unit='bar', record_flush=60.0)
     session = stage.start()
-    requests_that_wait_are_all_answered_in_one_turn(stage)
     what_cannot_be_done_is_answered_and_ends_nothing(stage)
     assert session.listening
     another_node_of_the_same_name_is_told(stage)
     a_sample_that_does_not_agree_with_the_parameters_is_told_once(stage)
     a_curve_is_on_disk_before_anybody_is_told(stage, session, tmp_path, monkeypatch)
-
-
-def requests_that_wait_are_all_answered_in_one_turn(stage):
-    names = ('refit', 'acknowledge_alarms')
-    clients = [stage.node.create_client(Trigger, f'/valveflow_monitor/{n}') for n in names]
-    wait_until(lambda: all(c.service_is_ready() for c in clients), 'the services', 20.0)
-    asked = [client.call_async(Trigger.Request()) for client in clients * 5]
-    time.sleep(0.3)  # until all have arrived; nothing takes them meanwhile
-    monitor_node.serve_requests(stage.monitor, 10.0)
-    for answer in asked:
-        wait_until(
-            lambda a=answer: stage.executor.spin_once(timeout_sec=0.01) or a.done(),
-            'the answer', 20.0,
-        )  # fmt: skip
-    assert not any(answer.result().success for answer in asked)
 
 
 def what_cannot_be_done_is_answered_and_ends_nothing(stage):

@@ -14,7 +14,6 @@ from std_msgs.msg import Float64MultiArray
 from valveflow_msgs.msg import Alarm, Diagnosis, FlowCharacteristic
 from valveflow_msgs.msg import JournalEntry as JournalMessage
 
-from valveflow_ros.curve.shift import Shift
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.monitoring.alarm_state import BURIED, AlarmAction
@@ -26,7 +25,6 @@ from valveflow_ros.monitoring.events import (
     Event,
     JournalEntry,
     JournalKind,
-    ReferenceSet,
 )
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import JournalReplayer
@@ -199,17 +197,6 @@ def test_the_cutting_of_the_stream_leaves_no_trace():
 
 def test_of_the_alarms_so_many_are_kept_that_none_that_stands_is_buried():
     assert OUTPUTS['alarms'].kept > BURIED + 1
-
-
-def test_the_messages_follow_reference_and_curve():
-    outputs = Outputs('u')
-    told = list(outputs.of([ReferenceSet(REFERENCE)]))
-    assert [o.name for o in told] == ['characteristic', 'breakpoints', 'slopes']
-    shift = Shift('then', 'now', 1, 1, (), 0, 0, 0, 'It moved.')
-    list(outputs.of([CurveAdopted(REFERENCE, shift)]))
-    assert (outputs.reference_id, outputs.shift) == (REFERENCE.model_id, shift)
-    list(outputs.of([CurveAdopted(REFERENCE)]))
-    assert outputs.shift is None
 
 
 def test_plain_arrays_say_their_unit():

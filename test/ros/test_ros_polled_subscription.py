@@ -111,17 +111,6 @@ def test_best_effort_and_reliable_publishers_are_both_heard(node):
         node.destroy_publisher(publisher)
 
 
-def test_a_publisher_that_does_not_match_is_told(node):
-    heard = []
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    source = PolledSubscription(node, Float64, 'value', reliable=True, on_mismatch=heard.append)
-    publisher_for(node, source, reliable=False)
-    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or heard, 'the mismatch', 20.0)
-    assert set(heard) == {'/value'}
-    executor.shutdown()
-
-
 def test_names_are_resolved_and_remapped(context):
     options = ['--ros-args', '-r', 'value:=/plant/other']
     node = Node('remapped', context=context, namespace='unit1', cli_args=options)

@@ -63,16 +63,6 @@ def test_with_the_profile_a_node_listens_to_this_host_alone(ros_environment, dis
         assert {address for address, _ in found} == {LOOPBACK}
 
 
-def test_the_profile_is_installed_and_closed():
-    text = PROFILE.read_text()
-    assert '<useBuiltinTransports>false</useBuiltinTransports>' in text
-    assert 'is_default_profile="true"' in text
-    assert text.count('<address>') == text.count(f'<address>{LOOPBACK}</address>') == 3
-    assert "files('config/*')" in (ROOT / 'setup.py').read_text()
-
-
-# Demanded security
-
 KEYS = 'KEYS'
 ENABLE, STRATEGY, KEYSTORE = (f'ROS_SECURITY_{x}' for x in ('ENABLE', 'STRATEGY', 'KEYSTORE'))
 ENFORCED = {ENABLE: 'true', STRATEGY: 'Enforce'}

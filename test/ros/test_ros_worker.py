@@ -309,15 +309,6 @@ def test_memory_is_given_back_once_after_an_outcome_when_the_task_was_let_go(mon
     assert held == [False]
 
 
-def test_memory_is_given_back_by_what_the_c_library_has_or_not_at_all(monkeypatch):
-    worker_module.release_memory()
-    asked = []
-    for library in (SimpleNamespace(malloc_trim=asked.append), SimpleNamespace()):
-        monkeypatch.setattr(worker_module.ctypes, 'CDLL', lambda _, found=library: found)
-        worker_module.release_memory()
-    assert asked == [0]
-
-
 def test_a_process_that_gets_no_descriptors_is_an_outcome(monkeypatch):
     def refuse():
         raise OSError(errno.EMFILE, 'Too many open files')
