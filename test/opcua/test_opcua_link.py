@@ -137,8 +137,6 @@ ODD = [
     ({'value': 'text', 'kind': 'String'}, 'wrong_type', Quality.BAD),
     ({'value': True, 'kind': 'Boolean'}, 'wrong_type', Quality.BAD),
     ({'value': 'nan'}, 'not_finite', Quality.BAD),
-    ({'value': 1.0, 'offset_s': 3600.0}, 'future', Quality.UNCERTAIN),
-    ({'value': 2.0, 'offset_s': -3600.0}, 'went_back', Quality.GOOD),
     ({'value': 3.0, 'status': 'UncertainSensorNotAccurate'}, 'uncertain', Quality.UNCERTAIN),
     ({'value': 4.0, 'status': 'BadSensorFailure'}, 'bad', Quality.BAD),
     ({'value': 150, 'kind': 'Int32'}, 'received', Quality.GOOD),

@@ -14,7 +14,7 @@ from valveflow_ros.opcua.sampler import Change, Sampler
 from valveflow_ros.records import NS_PER_S, Quality
 
 S, T0 = NS_PER_S, 1_700_000_000 * NS_PER_S
-GOOD, _, BAD = (int(q) for q in Quality)
+GOOD, UNCERTAIN, BAD = (int(q) for q in Quality)
 
 
 @pytest.fixture(scope='module')
@@ -80,12 +80,15 @@ def test_history_fills_the_samples_that_still_wait(sampler):
     assert sampler.counts[3].went_back == 0
 
 
-def test_a_value_without_a_time_counts_from_its_arrival(sampler):
-    """Other odd values: `test_odd_values_are_counted_and_have_their_quality` of the link."""
-    sampler.take([Change(3, 0, T0 + 1, 5.0, GOOD)], T0 + S)
-    (sample,) = sampler.due(T0 + S)
-    assert sampler.counts[3].without_time == 1
-    assert (sample.values[3], sample.quality[3]) == (5.0, GOOD)
+def test_odd_stamps_are_counted_and_a_future_one_is_uncertain(sampler):
+    """Odd values: `test_odd_values_are_counted_and_have_their_quality` of the link."""
+    odd = ((T0 + 3600 * S, 'future', UNCERTAIN), (T0 - S, 'went_back', GOOD),
+           (0, 'without_time', GOOD))  # fmt: skip
+    for k, (source_ns, name, quality) in enumerate(odd, 1):
+        sampler.take([Change(3, source_ns, T0 + k * S, 5.0, GOOD)], T0 + k * S)
+        (sample,) = sampler.due(T0 + k * S)
+        assert getattr(sampler.counts[3], name) == 1
+        assert (sample.values[3], sample.quality[3]) == (5.0, quality)
 
 
 def test_a_machine_that_slept_does_not_send_a_day_at_once(sampler):
