@@ -115,7 +115,7 @@ class OpcUaServer:
         return process
 
     def set(self, name: str, value: Any, **more: Any) -> None:
-        """Write a value: status, offset_s of the source timestamp, kind of the Variant."""
+        """Write a value: status, kind of the Variant."""
         stdin, stdout = self.process.stdin, self.process.stdout
         assert stdin is not None
         assert stdout is not None
@@ -255,8 +255,7 @@ async def serve(options: argparse.Namespace) -> None:
 async def _write(server: Any, nodes: dict[str, Any], asked: dict[str, Any]) -> None:
     from asyncua import ua
 
-    now = datetime.datetime.now(datetime.timezone.utc)
-    stamp = now + datetime.timedelta(seconds=asked.get('offset_s', 0.0))
+    stamp = datetime.datetime.now(datetime.timezone.utc)
     kind = getattr(ua.VariantType, asked.get('kind', 'Double'))
     value = ua.Variant(float('nan') if asked['value'] == 'nan' else asked['value'], kind)
     status = ua.StatusCode(getattr(ua.StatusCodes, asked.get('status', 'Good')))
