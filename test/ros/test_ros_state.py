@@ -146,6 +146,8 @@ def test_a_file_that_is_too_large_is_not_even_read(folder, monkeypatch):
 
 def test_what_is_made_again_in_the_folder_of_another_one_is_nothing(folder):
     place = folder.folder
+    folder.write(b'x')
+    assert not folder.altered
     shutil.rmtree(place)
     folder.write_curve(CURVE)
     assert repr(folder.curve(CURVE.model_id)) == repr(CURVE)
