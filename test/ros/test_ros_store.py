@@ -77,15 +77,16 @@ def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path):
 
 
 def test_a_state_of_other_parameters_is_used_unless_it_is_of_another_unit(tmp_path):
-    written(tmp_path)
-    for more, words in (
+    for k, (more, words) in enumerate((
         ({'generated_power_unit': 'kW'}, 'It was made with another generated_power_unit.'),
         ({'main_steam_pressure_unit': 'bar', 'model_file': 'x', 'block': 20.0},
          'It was made with another main_steam_pressure_unit and model_file.'),
         ({'block': 20.0, 'window_days': 5.0, 'sample_period': 2.0}, ''),
         ({'alarm_limit': 3.0, 'refit_period': 60.0, 'record_keep': 5}, ''),
-    ):  # fmt: skip
-        with store(tmp_path, **more) as found:
+    )):  # fmt: skip
+        folder = tmp_path / str(k)
+        written(folder)
+        with store(folder, **more) as found:
             assert (found.saved is None) == bool(words)
             assert words in found.sentence
             # It waits for a run that it fits.
