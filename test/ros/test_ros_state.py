@@ -19,7 +19,7 @@ from valveflow_ros.errors import DataError, RecordingError
 from valveflow_ros.parameters import Settings
 from valveflow_ros.ros.node import state_store
 from valveflow_ros.ros.node.engine import example_curve
-from valveflow_ros.ros.node.state_store import LOCK, InUseError, StateFolder
+from valveflow_ros.ros.node.state_store import LOCK, STATE, InUseError, StateFolder
 from valveflow_ros.state import from_bytes
 
 CURVE = example_curve(Settings()).with_id()
@@ -43,6 +43,19 @@ def test_of_two_states_that_do_not_fit_the_larger_one_is_kept_aside(folder):
         largest = data if len(data) > len(largest) else largest
         assert folder.read(folder.aside) == largest
     assert folder.read() == b''
+
+
+def test_taking_back_twice_changes_nothing(folder):
+    folder.write(b'mended')
+    folder.aside.write_bytes(b'before')
+    for _ in range(2):
+        now, aside = folder.read(), folder.read(folder.aside)
+        folder.swap_aside()
+        assert (folder.read(), folder.read(folder.aside)) == (aside, now)
+    folder.path.unlink()
+    folder.swap_aside()
+    assert (folder.read(), folder.read(folder.aside)) == (b'before', None)
+    assert {p.name for p in folder.folder.iterdir()} == {LOCK, STATE}
 
 
 @pytest.mark.parametrize('mask', [0o000, 0o077])
