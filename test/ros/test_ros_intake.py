@@ -303,6 +303,17 @@ def test_the_clock_track_answers_as_a_search_through_all_would(noted):
         assert track.at(asked) == expected
 
 
+def test_the_clock_track_stays_bounded_and_forgets_the_beginning():
+    track = ClockTrack()
+    assert (track.first_ns, track.lead_ns(5)) == (0, 0)
+    for k in range(100_000):
+        track.note(10 + k, 1000 + k)
+        if k < 100:
+            assert (track.first_ns, track.lead_ns(3), track.lead_ns(10 + k)) == (1000, 7, 0)
+    assert len(track._sent_ns) <= 2 * 16384
+    assert (track.at(100_009), track.lead_ns(3)) == (100_999, 0)
+
+
 def test_gaps_in_the_numbers_are_losses_but_not_before_the_first():
     for numbers, lost, missed in (((1, 2, 5, 6, 10), 5, 0), ((8,), 0, 7)):
         statistics = TopicStatistics()
