@@ -225,17 +225,14 @@ def after_known_changes(series: SegmentResiduals, known_ns: int) -> SegmentResid
     return series.part(np.arange(found.place, len(series)))
 
 
-def common_change(
-    series: Sequence[SegmentResiduals], known_ns: int, share: float = 0.95
-) -> tuple[int, int, int]:
+def common_change(series: Sequence[SegmentResiduals], known_ns: int) -> tuple[int, int, int]:
     """Return the common time of change of several pieces of a curve, with an interval.
 
     Each piece has a level before and a level after the time; one member on a side is enough, for
     the members of all pieces determine the time together.
 
-    Changes before ``known_ns`` are not considered; ``share`` is the probability of the interval.
-    Return median, lower and upper end of the distribution of the time, ns, for a prior that is
-    uniform in time; 0, 0, 0 if no common change is seen.
+    Changes before ``known_ns`` are not considered. Return median and 95 % interval of the time in
+    ns, for a prior that is uniform in time; 0, 0, 0 if no common change is seen.
     """
     edges = np.unique(np.concatenate([s.time_ns for s in series]))
     allowed = edges[1:] > known_ns
@@ -276,8 +273,7 @@ def common_change(
     edges = np.maximum(edges, known_ns)
     mass = np.exp(likelihood - likelihood.max()) * np.diff(edges)
     reached = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
-    side = 0.5 * (1.0 - share)
-    offset = np.interp([0.5, side, 1.0 - side], reached, (edges - edges[0]).astype(np.float64))
+    offset = np.interp([0.5, 0.025, 0.975], reached, (edges - edges[0]).astype(np.float64))
     middle, low, high = (int(edges[0]) + int(v) for v in offset)
     return middle, low, high
 

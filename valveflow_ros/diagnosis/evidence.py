@@ -107,12 +107,12 @@ def held_out(task: Task, model: Extended) -> FloatArray:
     return out
 
 
-def long_run_variance(scores: FloatArray, lags: int = _LAGS) -> float:
+def long_run_variance(scores: FloatArray) -> float:
     """Return the Newey-West variance of the sum of block scores."""
     centred = scores - scores.mean()
     total = float(centred @ centred)
-    for k in range(1, min(lags, len(scores) - 1) + 1):
-        total += 2.0 * (1.0 - k / (lags + 1.0)) * float(centred[k:] @ centred[:-k])
+    for k in range(1, min(_LAGS, len(scores) - 1) + 1):
+        total += 2.0 * (1.0 - k / (_LAGS + 1.0)) * float(centred[k:] @ centred[:-k])
     return max(total, 0.1 * float(centred @ centred))
 
 

@@ -68,11 +68,11 @@ def p_value(value: float) -> str:
     return 'p < 0.0001' if value < 1e-4 else f'p = {plain(value, 2)}'
 
 
-def places_for(error: float, digits: int = 2) -> int:
-    """Return the number of decimals at which an error has ``digits`` significant digits."""
+def places_for(error: float) -> int:
+    """Return the number of decimals at which an error has two significant digits."""
     if not math.isfinite(error) or error <= 0.0:
         return 0
-    return max(0, digits - 1 - math.floor(math.log10(error)))
+    return max(0, 1 - math.floor(math.log10(error)))
 
 
 def with_error(value: float, error: float, unit: str = '') -> str:

@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import tzinfo
 from itertools import pairwise
@@ -271,20 +271,13 @@ def _changes(before: Frame, now: Frame) -> Iterator[tuple[str, str]]:
 
 
 class Screen:
-    """Show frames: in place on a terminal, otherwise as one line per change.
+    """Show frames: in place on a terminal, otherwise as one line per change."""
 
-    ``environment`` has ``TERM`` and ``NO_COLOR``; by default it is that of the process.
-    """
-
-    def __init__(
-        self, out: TextIO, environment: Mapping[str, str] | None = None,
-        zone: tzinfo | None = None,
-    ) -> None:  # fmt: skip
-        known = os.environ if environment is None else environment
+    def __init__(self, out: TextIO, zone: tzinfo | None = None) -> None:
         self._out, self._zone = out, zone
         terminal = out.isatty()
-        self.in_place = terminal and known.get('TERM', 'dumb') not in ('dumb', '')
-        self._colour = self.in_place and not known.get('NO_COLOR')
+        self.in_place = terminal and os.environ.get('TERM', 'dumb') not in ('dumb', '')
+        self._colour = self.in_place and not os.environ.get('NO_COLOR')
         self._unicode = (out.encoding or '').lower().replace('-', '').startswith('utf')
         self._before = Frame()
         self._open = ExitStack()
