@@ -107,6 +107,9 @@ def test_a_residual_that_comes_back_soon_has_to_stay_away_for_longer():
     assert soon == [10.0, 20.0, 40.0, 80.0, 80.0, 80.0]
     assert desk.residual.reset(START_NS, 'm') == []
     assert returns_after_s(desk, now_s) == 10.0
+    desk.residual.shift_time(round(60 * NS_PER_S))
+    assert returns_after_s(desk, now_s + 101) == 20.0
+    assert returns_after_s(desk, now_s + 202) == 10.0  # after 90 s
 
 
 def test_a_shift_of_another_size_than_was_told_is_told_again():
