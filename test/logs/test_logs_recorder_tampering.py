@@ -44,9 +44,11 @@ def move_away(path):
 
 
 def replace_by_link(path):
-    other = path.parent.parent / 'other.bin'
-    path.rename(other)
-    path.symlink_to(other)
+    # At one moment: a recorder that looked in between would rightly find nothing.
+    other, draft = path.parent.parent / 'other.bin', path.with_name('draft')
+    os.link(path, other)
+    draft.symlink_to(other)
+    draft.replace(path)
 
 
 def replace_by_another(path):
