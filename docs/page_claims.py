@@ -180,11 +180,12 @@ def _diagnosis() -> list[Row]:
     r = result(_SMALL)
     silent = sum(not row['names'] for row in r['rows'])
     beside = r['records'] - r['right'] - silent
-    names = 'thermal_names_minute_951_960'
-    counts = ', '.join(
-        f'{_kind_words(kind)} {s["named"]} of {s["units"]} named'
-        for kind, s in result(names)['summary'].items()
-    )
+    healthy = [
+        _row(f'healthy units built from physics, {words}, eight days, no covariate',
+             ', '.join(f'{_kind_words(kind)} {s["named"]} of {s["units"]} named'
+                       for kind, s in result(name)['summary'].items()), name)
+        for words, name in _HEALTHY.items()
+    ]  # fmt: skip
     return [
         *rows,
         _row(
@@ -193,8 +194,7 @@ def _diagnosis() -> list[Row]:
             f'in {beside}; in {beside - r["named_with_confidence_wrongly"]} of these the true one '
             'is told as possible too', _SMALL,
         ),
-        _row('healthy units built from physics, means over a minute, eight days, no covariate',
-             counts, names),
+        *healthy,
         _since_model(),
     ]  # fmt: skip
 

@@ -13,7 +13,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Estimate, FittedCause, SentenceValues, told
 from valveflow_ros.diagnosis.causes import catalogue
-from valveflow_ros.diagnosis.causes.since_model import CURVE, Change, since_model
+from valveflow_ros.diagnosis.causes.since_model import CURVE, SINCE_MODEL, Change, since_model
 from valveflow_ros.diagnosis.evidence import (
     LARGEST_P,
     Certainty,
@@ -21,9 +21,11 @@ from valveflow_ros.diagnosis.evidence import (
     by_segment,
     gain_of_form,
     inferred,
+    more_or_less,
     noise_floor,
     rmse,
     sealed_gain,
+    where_largest,
 )
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import (
@@ -597,9 +599,13 @@ def _meaning(task: Task, model: Extended, cause: FittedCause) -> str:
         return f'{where} the power is not changed, at other loads by up to {most:.2g} MW.'
     if not level:
         return f'{where} the power changes by up to {reach:.2g} MW.'
-    said = f'{where} this makes {abs(level):.2g} MW {"more" if level > 0.0 else "less"}'
-    drifts = cause.cause.slow and onset is None and not cause.extra and cause.name != 'diurnal'
-    return f'{said} at the end of the record than at its beginning.' if drifts else f'{said}.'
+    said = f'{where} this makes {more_or_less(level)}'
+    if cause.cause.slow and onset is None and not cause.extra and cause.name != 'diurnal':
+        said += ' at the end of the record than at its beginning'
+    largest = where_largest(
+        power, level, lambda rows: _worth(cause, moved[rows], day[rows], onset, days)[0]
+    )
+    return f'{said}{largest}.'
 
 
 def _worth(
@@ -792,13 +798,17 @@ def _sentence(d: Diagnosis) -> str:
             f'remaining difference between model and measurement is {slow}noise.{wander}'
         )
     but = f' {counted(len(blind), "cause")} {unseen}.' if blind else ''
-    near = f' Most similar: {", ".join(d.not_told_apart)}.' if d.not_told_apart else ''
-    besides = ''.join(f' Found besides: {c.sentence}' for c in d.causes)
+    alike = ', '.join(d.not_told_apart)
+    near = f' These would look alike here: {alike}.' if alike else ''
+    first = ''.join(f'{c.sentence} ' for c in d.causes if c.name in SINCE_MODEL)
+    besides = ''.join(
+        f' Found besides: {c.sentence}' for c in d.causes if c.name not in SINCE_MODEL
+    )
     if d.unexplained_by == (_THE_TIME,):
-        return f'{wander.strip()}{but}{besides}'
+        return f'{first}{wander.strip()}{but}{besides}'
     names = listed([_IN_WORDS.get(name, name) for name in d.unexplained_by])
     return (
-        f'Measured and simulated power differ by {d.rmse_extended:.2g} MW (root mean square). '
-        f'Part of this depends on {names}, and no cause of the catalogue explains it.'
-        f'{wander}{near}{but}{besides}'
+        f'{first}Measured and simulated power {"still " if first else ""}differ by '
+        f'{d.rmse_extended:.2g} MW (root mean square). Part of this depends on {names}, and no '
+        f'cause of the catalogue explains it.{wander}{near}{but}{besides}'
     )

@@ -116,6 +116,39 @@ def long_run_variance(scores: FloatArray) -> float:
     return max(total, 0.1 * float(centred @ centred))
 
 
+_LOADS = 8  # classes of load in which the effect of a cause is compared
+_LARGER = 1.3  # factor by which it is larger at another load than at full load, to be told
+
+
+def more_or_less(mw: float) -> str:
+    """Return a change of the power in words."""
+    return f'{abs(mw):.2g} MW {"more" if mw > 0.0 else "less"}'
+
+
+def where_largest(
+    power: FloatArray, at_full_load: float, size_of: Callable[[BoolArray], float]
+) -> str:
+    """Return words on the load where an effect is largest; '' if that is about full load.
+
+    Parameters
+    ----------
+    power : float64 (m,)
+        MW without the effect.
+    at_full_load : float
+        Size of the effect there, MW.
+    size_of : callable
+        Size of the effect, MW, in some of the rows, as a mask (m,).
+    """
+    edges = np.quantile(power, np.linspace(0.0, 1.0, _LOADS + 1))
+    classes = [(power >= low) & (power <= high) for low, high in itertools.pairwise(edges)]
+    sizes = [size if np.isfinite(size := size_of(rows)) else 0.0 for rows in classes]
+    most = int(np.argmax(np.abs(sizes)))
+    if abs(sizes[most]) < _LARGER * abs(at_full_load):
+        return ''
+    load = float(np.median(power[classes[most]]))
+    return f'; at {load:.0f} MW, where it is largest, {more_or_less(sizes[most])}'
+
+
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """The evidence for a cause.

@@ -18,7 +18,7 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Estimate
-from valveflow_ros.diagnosis.evidence import sealed_gain
+from valveflow_ros.diagnosis.evidence import more_or_less, sealed_gain, where_largest
 from valveflow_ros.diagnosis.extended import Extended, answer, drive
 from valveflow_ros.diagnosis.fitting import Task, levels_along
 from valveflow_ros.diagnosis.result import NamedCause
@@ -91,6 +91,7 @@ _KINDS = {
         'Since the model given was found the power is {change} at every load', math.inf,
     ),
 }  # fmt: skip
+SINCE_MODEL = (CURVE, *_KINDS)
 _BEFORE = 'it changed before this record begins'
 _EXPERIMENT = (
     'An hour on the flat end of the curve and an hour at low load: a change of the input vanishes '
@@ -134,33 +135,10 @@ class Change:
         after = plain if self.name == CURVE else self.changed
         gain = sealed_gain(task, self.given, after, len(_KINDS) + 1)
         experiment = _EXPERIMENT if self.near else ''
-        full = float(np.quantile(answer(task.grids, self.given)[task.rows], _FULL_LOAD))
-        before, now = _per_percent(task, full, self.given.base, after.base)
-        meaning = f'{self.meaning} There' if self.meaning else _where(full)
-        meaning += f' 1 % of opening gives {now:.3g} MW, in the model given {before:.3g} MW.'
         return NamedCause(
             self.name, self.sentence, self.parameters, gain, experiment, self.near,
-            meaning=meaning,
+            meaning=self.meaning,
         )  # fmt: skip
-
-
-def _where(full: float) -> str:
-    return f'At full load (from {full:.0f} MW on)'
-
-
-def _per_percent(
-    task: Task, full: float, given: RegionalModel, now: RegionalModel
-) -> tuple[float, float]:
-    """Return the mean MW per 1 % of opening of two models where the first gives full load."""
-    grids = task.grids
-    rows = (grids.usable > 0) & (given.static(grids.u, grids.scale) >= full)
-    u, scale = grids.u[rows], grids.scale[rows]
-    step = _SECANT * u / grids.pressure[rows] ** grids.form.input_exponent
-    first, second = (
-        m.static(u * (1.0 + _SECANT), scale) - m.static(u * (1.0 - _SECANT), scale)
-        for m in (given, now)
-    )
-    return float(np.mean(first / step) / 2.0), float(np.mean(second / step) / 2.0)
 
 
 def since_model(task: Task, base: RegionalModel) -> Change | str:
@@ -309,7 +287,8 @@ def _change(
     sentence = f'{said} (95 % interval {ends[0]} to {ends[1]} {unit}); {_BEFORE}.'
     full = float(np.quantile(here, _FULL_LOAD))
     by = float(np.mean(moved[here >= full]))
-    meaning = f'{_where(full)} this makes {abs(by):.2g} MW {"more" if by > 0.0 else "less"}.'
+    meaning = f'At full load (from {full:.0f} MW on) this makes {more_or_less(by)}'
+    meaning += where_largest(here, by, lambda rows: float(np.mean(moved[rows]))) + '.'
     return Change(
         name, given, changed, {kind.parameter: Estimate(value, low, high, kind.unit)},
         sentence, meaning,
