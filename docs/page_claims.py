@@ -44,6 +44,7 @@ _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
 _SMALL = 'diagnosis_hidden_30000_30002_5d'
+_NAMES = {'means over a minute': 'thermal_names_minute_3201_3217'}
 _KIND_WORDS = {
     'choked': 'choked', 'sequence': 'valves in sequence', 'integrated_input': "the paper's form",
 }  # fmt: skip
@@ -184,7 +185,7 @@ def _diagnosis() -> list[Row]:
         _row(f'healthy units built from physics, {words}, eight days, no covariate',
              ', '.join(f'{_kind_words(kind)} {s["named"]} of {s["units"]} named'
                        for kind, s in result(name)['summary'].items()), name)
-        for words, name in _HEALTHY.items()
+        for words, name in _NAMES.items()
     ]  # fmt: skip
     return [
         *rows,

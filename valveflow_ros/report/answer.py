@@ -26,6 +26,7 @@ from valveflow_ros.signals.static_form import LEAST_PRESSURE_RANGE, OPENING, pre
 
 # Below this explained fraction of the power, it depends on something else, or a signal is wrong.
 _LITTLE = 0.8
+_WELL_KNOWN = 0.1  # 95 % error of every slope, as a fraction of the steepest
 _NO_EFFECT = 0.1  # of the range of the power, for the whole range of the opening
 _FLAT = 0.2  # slope relative to the steepest piece, below which a piece is reported as flat
 
@@ -45,13 +46,19 @@ def explained(data: Identified) -> float:
 def doubt(data: Identified) -> str:
     """Return a warning if the curve is unreliable; empty otherwise."""
     share, misfit = explained(data), data.misfit
-    if share < _LITTLE:
+    if share < _LITTLE and not _slope_error(data) <= _WELL_KNOWN:
         return (
             f'Do not rely on this curve: it explains only {say.percent(share)} of the variance of '
             'the power. Look whether a signal is constant, taken for another one, or in another '
             'unit.'
         )
     told = [words] if (words := _no_effect(data)) else []
+    if share < _LITTLE:
+        told.append(
+            f'The curve explains only {say.percent(share)} of the variance of the power: the unit '
+            'moved little, or something that was not logged moves the power. The slopes are known '
+            'within 10 %.'
+        )
     if misfit is not None:
         told.append(
             f'Do not rely on this curve: it is wrong by {misfit_words(misfit)}. The power depends '
@@ -60,6 +67,12 @@ def doubt(data: Identified) -> str:
     if form := wrong_form(data.characteristic):
         told.append(form)
     return ' '.join(told)
+
+
+def _slope_error(data: Identified) -> float:
+    """Return the largest 95 % error of a slope, as a fraction of the steepest slope."""
+    slope, error = np.array([(p.slope, p.slope_stderr) for p in data.characteristic.pieces]).T
+    return float(1.96 * np.max(error) / max(float(np.max(np.abs(slope))), 1e-300))
 
 
 def _no_effect(data: Identified) -> str:
@@ -586,9 +599,11 @@ def pieces_doubt(c: Characteristic) -> str:
         return ''
     chosen = _percent(c.choice.confidence[len(c.pieces)])
     others = ', '.join(f'{j} of {_percent(p)}' for j, p in likely.items())
+    right = ' The 95 % intervals of the breakpoints are valid only for the right number.'
+    of_breakpoints = right if len(c.pieces) > 1 else ''
     return (
         f'The number of pieces is not certain: {len(c.pieces)} has a probability of {chosen}, '
-        f'{others}. The 95 % intervals of the breakpoints are valid only for the right number.'
+        f'{others}.{of_breakpoints}'
     )
 
 

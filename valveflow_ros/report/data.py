@@ -157,10 +157,11 @@ def coverage_figure(data: Identified) -> Figure | None:
         'shapes': [plot.upright(float(b), 'curve', 1.5, dash='dot') for b in c.breakpoints[1:-1]],
     }  # fmt: skip
     share = say.percent(len(data.special) / len(known), 2)
+    dotted = 'Dotted, the breakpoints. ' if len(data.characteristic.pieces) > 1 else ''
     caption = (
         f'<b>Every piece needs special segments.</b> How long the unit ran at each {u}; blue, the '
-        f'part in special segments, {share} of all. Dotted, the breakpoints. Where there is '
-        'little blue, more data at that load would make the curve more certain.'
+        f'part in special segments, {share} of all. {dotted}Where there is little blue, more '
+        'data at that load would make the curve more certain.'
     )
     words = (
         f'Hours by {u} from {say.plain(float(edges[0]))} to {say.plain(float(edges[-1]))}; '
