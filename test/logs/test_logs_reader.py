@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of ours and of others are read, and what cannot be read is one sentence."""
 
+import json
 import os
 import struct
 import zlib
@@ -53,6 +54,37 @@ def foreign(
                 writer.add_message(channel, START_NS + step, data, START_NS + step)
         writer.finish()
     return path
+
+
+def test_the_inputs_of_a_monitor_are_those_that_it_names(tmp_path):
+    """Also where a remapping gave them other names, as tags of a control system."""
+
+    def written(folder, topics, **attachments):
+        writer = RecordingWriter(tmp_path / folder, definitions=STOCK, attachments=attachments)
+        for topic in topics:
+            writer.add_topic(topic, FLOAT64)
+        for step in range(5):
+            for value, topic in enumerate(topics):
+                at = START_NS + 10 * step + value
+                writer.write(topic, float64(value + step), at, at)
+        writer.close()
+        return tmp_path / folder
+
+    usual = [f'/{info.topic}' for info in SIGNALS if info.required]
+    theirs = ['/gw/HV101', '/gw/PT101', usual[2], '/gw/main_steam_pressure']
+    told = {name[1:]: topic for name, topic in zip(usual, theirs, strict=True)}
+    told |= {'valve_command': '/gw/never_came', 'vacuum': '/gw/vacuum'}
+    named = {'topics.json': json.dumps({'inputs': told}).encode()}
+    plain = open_log(written('plain', usual))
+    found = open_log(written('remapped', theirs, **named))
+    assert read_back(found) == read_back(plain)
+    assert set(found.signals.values()) == set(theirs)
+    # What somebody asks for comes first, and what is no list of topics is no list.
+    wanted = {'main_steam_pressure': '/gw/main_steam_pressure'}
+    asked = open_log(tmp_path / 'remapped', columns=wanted)
+    assert asked.signals[Signal.MAIN_STEAM_PRESSURE] == '/gw/main_steam_pressure'
+    odd = open_log(written('odd', theirs, **{'topics.json': b'[1]'}))
+    assert set(odd.signals) == {Signal.MAIN_STEAM_TEMPERATURE, Signal.MAIN_STEAM_PRESSURE}
 
 
 def naive_readings(messages):

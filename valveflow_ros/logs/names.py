@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 
@@ -15,6 +16,8 @@ from valveflow_ros.records import SIGNALS, ByteArray, Quality, Signal
 FLOAT64 = 'std_msgs/msg/Float64'
 PLANT_SAMPLE = 'valveflow_msgs/msg/PlantSample'
 PLANT_SAMPLE_TOPIC = 'plant_sample'
+# The attachment in which a monitor names its topics: {"inputs": {name of the input: topic}, ...}.
+TOPICS = 'topics.json'
 # Quality codes 0 to 3 of a PlantSample; 0 means that the sender did not set the code.
 _CODES = (Quality.BAD, Quality.GOOD, Quality.UNCERTAIN, Quality.BAD)
 # Codes 0 to 2 in older recordings, which had no code for an unset quality.
@@ -41,6 +44,18 @@ def signal_of(name: str) -> Signal:
 def last_part(topic: str) -> str:
     """Return the part of a topic after its last slash."""
     return topic.rsplit('/', 1)[-1]
+
+
+def told_inputs(attachments: Mapping[str, bytes]) -> dict[str, str]:
+    """Return the topic of each input that the monitor of a recording names, by contract name."""
+    try:
+        told = json.loads(attachments[TOPICS])['inputs'].items()
+    except (KeyError, ValueError, TypeError, AttributeError):
+        return {}
+    return {
+        name: topic for name, topic in told
+        if isinstance(topic, str) and (name in _TOPICS or name == PLANT_SAMPLE_TOPIC)
+    }  # fmt: skip
 
 
 def has_earlier_codes(definition: str) -> bool:

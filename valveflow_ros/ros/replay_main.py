@@ -17,7 +17,7 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import DataError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, open_log
-from valveflow_ros.logs.names import has_earlier_codes
+from valveflow_ros.logs.names import TOPICS, has_earlier_codes
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.progress import Progress
 from valveflow_ros.report.terminal.text import number
@@ -30,7 +30,6 @@ from valveflow_ros.ros.decoding import (
 )
 from valveflow_ros.ros.domain import run
 from valveflow_ros.ros.encoding import float64_bytes
-from valveflow_ros.ros.node.recording import TOPICS
 from valveflow_ros.ros.player import Player, Step
 from valveflow_ros.ros.process import Parser, StopFlag, complain, with_place
 from valveflow_ros.ros.verify import verify

@@ -17,7 +17,13 @@ from valveflow_ros.logs.mcap.folder import Split, recording_files
 from valveflow_ros.logs.mcap.gather import FileContents, Group, Rows, gather
 from valveflow_ros.logs.mcap.records import HEAD_SIZE, LayoutError, MessageTable, walk
 from valveflow_ros.logs.mcap.scan import Scanner, scan_warnings, why_empty
-from valveflow_ros.logs.names import PLANT_SAMPLE_TOPIC, TopicChoice, misfits
+from valveflow_ros.logs.names import (
+    PLANT_SAMPLE_TOPIC,
+    TopicChoice,
+    last_part,
+    misfits,
+    told_inputs,
+)
 from valveflow_ros.logs.source import OverBudgetError, Source
 from valveflow_ros.records import IntArray, Readings, Signal
 
@@ -145,6 +151,47 @@ def read_recording(paths: list[Path], name: str, columns: Mapping[str, str]) -> 
     topic holds a signal.
     """
     choice = TopicChoice(columns)
+    files, warnings = _gathered(paths, choice, name)
+    types = _types(files, name)
+    attachments: dict[str, bytes] = {}
+    for file in files:
+        attachments |= {found.name: found.data for found in file.findings.attachments}
+    remapped = {
+        signal: topic for signal, topic in told_inputs(attachments).items()
+        if topic in types and last_part(topic) != signal and signal not in columns
+        and topic not in columns.values()
+    }  # fmt: skip
+    if remapped:
+        # What these topics hold was not kept at the first reading.
+        choice = TopicChoice({**remapped, **columns})
+        files, warnings = _gathered(paths, choice, name)
+    chosen = choice.signals(types, name)
+    stamped = choice.plant_sample(types, name)
+    for file in files:
+        what = 'file' if len(paths) == 1 else f'file {Path(file.path).name}'
+        warnings += [*scan_warnings(file.findings, what), *_file_warnings(file, what)]
+    warnings += _choice_warnings(types, chosen, stamped, name)
+    found, told = _timed(_readings(files, chosen))
+    groups = [group for file in files for group in file.groups]
+    signals = {signal: topic for topic, signal in chosen.items()}
+    if stamped is not None:
+        for number in np.unique(found[0].signal).tolist():
+            signals.setdefault(Signal(number), stamped)
+    metadata: dict[str, dict[str, str]] = {}
+    for file in files:
+        metadata |= dict(file.findings.metadata)
+    times = min(group.first_ns for group in groups), max(group.last_ns for group in groups)
+    damaged = sum(file.findings.damaged for file in files)
+    return LogContents(
+        name, *found, _topics(files, types, chosen), signals, (*warnings, *told), attachments,
+        metadata, *times, damaged, MessageReader(files).messages,
+    )  # fmt: skip
+
+
+def _gathered(
+    paths: list[Path], choice: TopicChoice, name: str
+) -> tuple[list[FileContents], list[str]]:
+    """Return the contents of the files that can be read, and why others cannot."""
     files: list[FileContents] = []
     warnings: list[str] = []
     for path in paths:
@@ -160,30 +207,7 @@ def read_recording(paths: list[Path], name: str, columns: Mapping[str, str]) -> 
             warnings.append(str(error))
     if not files:
         raise RecordingError(name, f'none of its files can be read ({warnings[0]})')
-    types = _types(files, name)
-    chosen = choice.signals(types, name)
-    stamped = choice.plant_sample(types, name)
-    for file in files:
-        what = 'file' if len(paths) == 1 else f'file {Path(file.path).name}'
-        warnings += [*scan_warnings(file.findings, what), *_file_warnings(file, what)]
-    warnings += _choice_warnings(types, chosen, stamped, name)
-    found, told = _timed(_readings(files, chosen))
-    groups = [group for file in files for group in file.groups]
-    signals = {signal: topic for topic, signal in chosen.items()}
-    if stamped is not None:
-        for number in np.unique(found[0].signal).tolist():
-            signals.setdefault(Signal(number), stamped)
-    attachments: dict[str, bytes] = {}
-    metadata: dict[str, dict[str, str]] = {}
-    for file in files:
-        attachments |= {found.name: found.data for found in file.findings.attachments}
-        metadata |= dict(file.findings.metadata)
-    times = min(group.first_ns for group in groups), max(group.last_ns for group in groups)
-    damaged = sum(file.findings.damaged for file in files)
-    return LogContents(
-        name, *found, _topics(files, types, chosen), signals, (*warnings, *told), attachments,
-        metadata, *times, damaged, MessageReader(files).messages,
-    )  # fmt: skip
+    return files, warnings
 
 
 def _types(files: list[FileContents], name: str) -> dict[str, str]:

@@ -26,6 +26,7 @@ from valveflow_ros.logs import (
     RecorderStatus,
     recover_leftovers,
 )
+from valveflow_ros.logs.names import TOPICS
 from valveflow_ros.logs.part_file import PART_SUFFIX, make_folder
 from valveflow_ros.logs.source import os_errors
 from valveflow_ros.parameters import Settings
@@ -33,7 +34,6 @@ from valveflow_ros.ros.node.diagnostics import Level
 
 DEFAULT_FOLDER = 'valveflow_recordings'
 PARAMETERS = 'parameters.json'
-TOPICS = 'topics.json'
 _CLOSE_S = 1.2
 _MOST_NAMES = 1000
 
