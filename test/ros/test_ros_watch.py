@@ -133,6 +133,17 @@ def test_with_two_monitors_one_has_to_choose(context, speaker, watch):
     other.destroy_node()
 
 
+def test_a_monitor_that_is_discovered_first_is_not_taken_for_the_only_one(
+    watch, executor, capsys, monkeypatch
+):
+    seen = iter([['/one'], ['/one'], ['/one', '/other']])
+    monkeypatch.setattr(watch_main, 'monitors', lambda node: next(seen, ['/one', '/other']))
+    monkeypatch.setattr(watch_main, '_FIND_S', 1.0)
+    executor.add_node(watch)
+    assert watch_main._ask(watch, executor, 'refit', '') == 1
+    assert 'Several monitors run: /one, /other.' in capsys.readouterr().err
+
+
 def test_one_picture_of_a_real_process(speaker, processes):
     process = processes.start('valveflow_ros.ros.watch_main', '--once', '--json')
     wait_until(lambda: speaker.go_on() or process.poll() is not None, 'the picture')
@@ -189,7 +200,7 @@ def test_the_monitor_is_asked_and_its_answer_told(
     (request,) = asked
     assert not alarm or (request.name, request.action) == ('residual', 'acknowledge')
     told = capsys.readouterr()
-    assert 'There is an answer.' in (told.out if success else told.err)
+    assert '/valveflow_monitor: There is an answer.' in (told.out if success else told.err)
 
 
 @pytest.mark.parametrize('there', [True, False])
@@ -197,6 +208,7 @@ def test_a_monitor_that_does_not_answer_is_told(
     context, watch, executor, capsys, monkeypatch, there
 ):
     monkeypatch.setattr(watch_main, '_FIND_S', 1.0)
+    monkeypatch.setattr(watch_main, '_ALONE_S', 0.3)
     speaker = Speaker(context) if there else None
     executor.add_node(watch)
     assert watch_main._ask(watch, executor, 'refit', '') == 1

@@ -32,8 +32,10 @@ from valveflow_ros.ros.process import Parser, complain
 
 _LOOK_S = 0.5
 # For --once: maximum time to find a monitor, and then to receive its health.
-_FIND_S, _HEAR_S = 5.0, 3.0
+_FIND_S, _HEAR_S = 8.0, 3.0
 _ANSWER_S = 10.0
+# A monitor is the only one if no other was discovered so long after it.
+_ALONE_S = 2.0
 # Suffix of the services that act on all alarms.
 _OF_ALARMS = '_alarms'
 
@@ -48,6 +50,7 @@ class WatchNode(Node):
         super().__init__('valveflow_watch', enable_rosout=False)
         self._wanted = full_name(monitor)
         self.several: tuple[str, ...] = ()
+        self._alone_since_s: dict[str, float] = {}
         self._heard: dict[str, Listener] = {}
         hear_health(self, self._heard)
 
@@ -62,13 +65,21 @@ class WatchNode(Node):
         return set().union(*(listener.heard for listener in self._heard.values()))
 
     def look(self) -> None:
-        """Look for the monitor if it is not found yet."""
+        """Look for the monitor if it is not found yet; without a name it must be the only one."""
         if self._heard:
             return
-        found = monitors(self)
+        found, now_s = monitors(self), time.monotonic()
         self.several = tuple(found) if len(found) > 1 and not self._wanted else ()
-        if self._wanted in found or (len(found) == 1 and not self._wanted):
-            name = self._wanted or found[0]
+        if self._wanted:
+            chosen = [self._wanted] if self._wanted in found else []
+        else:
+            # Nodes are discovered one after the other: the first is no reason to act on it.
+            alone = found if len(found) == 1 else []
+            self._alone_since_s = {name: self._alone_since_s.get(name, now_s) for name in alone}
+            chosen = [
+                n for n, since_s in self._alone_since_s.items() if now_s - since_s >= _ALONE_S
+            ]
+        for name in chosen:
             self._heard[name] = Listener(self, name, MonitorState())
 
     def frame(self) -> Frame:
@@ -188,9 +199,10 @@ def _ask(node: WatchNode, executor: SingleThreadedExecutor, service: str, alarm:
         executor.spin_until_future_complete(answer, timeout_sec=_ANSWER_S)
         if answer.done():
             response = answer.result()
+            told = f'{node.monitor}: {response.message}'
             if not response.success:
-                return complain('watch', response.message)
-            print(response.message, flush=True)
+                return complain('watch', told)
+            print(told, flush=True)
             return 0
     return complain(
         'watch',
