@@ -44,7 +44,10 @@ _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
 _SMALL = 'diagnosis_hidden_30000_30002_5d'
-_NAMES = {'means over a minute': 'thermal_names_minute_3201_3217'}
+_NAMES = {
+    'means over a minute': 'thermal_names_minute_3201_3217',
+    'compressed by exception': 'thermal_names_compressed_3301_3308',
+}
 _KIND_WORDS = {
     'choked': 'choked', 'sequence': 'valves in sequence', 'integrated_input': "the paper's form",
 }  # fmt: skip
@@ -57,7 +60,7 @@ def _kind_words(kind: str) -> str:
 
 _RECORDINGS = {
     'minute_2001_2100': 'means over a minute', '1s_5001_5010': 'every second',
-    'compressed_1101_1110': 'exceptions alone',
+    'compressed_1201_1210': 'exceptions alone',
 }  # fmt: skip
 
 

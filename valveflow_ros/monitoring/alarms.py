@@ -348,7 +348,8 @@ def _sentence(state: AlarmState, shift_mw: float, onset_ns: int) -> str:
     if state == AlarmState.UNACKNOWLEDGED:
         return (
             f'The unit gives {size} than its valve curve (mean over the loads seen){since}. '
-            'Check what changed then. If the change was intended, request a new curve (~/refit).'
+            'Check what changed then. If the change was intended, request a new curve (~/refit) '
+            'and make it the reference (~/set_reference).'
         )
     if state == AlarmState.ACKNOWLEDGED and not known:
         return 'Acknowledged; the difference in MW is not known yet.'
