@@ -143,7 +143,7 @@ def test_silence_from_the_start_and_after_speech():
     scene = Scene()
     scene.silence()
     scene.says(Level.OK, 'Waiting for /plant/valve_opening', listening=1.0)
-    scene.says(Level.STALE, 'Nobody publishes /plant/valve_opening')
+    scene.says(Level.STALE, 'Nobody publishes /plant/valve_opening or /plant/plant_sample;')
     scene.says(Level.OK, 'it is optional', COMMAND)
     scene.publishers = {OPENING: Publishers(1)}
     scene.says(Level.STALE, 'has a publisher, but nothing has come')
@@ -412,7 +412,7 @@ def test_an_alarm_whose_range_left_the_window_says_so(monitor):
     assert f'{ends}. ' in item.sentence
 
 
-def after(values, shelved=False):
+def after(values, shelved=False, curve='a curve'):
     """Return what diagnostics say after a second of each value."""
     nervous = {'alarm_on_delay': 0.0, 'alarm_off_delay': 0.0, 'alarm_suppress_time': 60.0}
     alarm = ResidualAlarm(Settings(nervous))
@@ -421,8 +421,8 @@ def after(values, shelved=False):
     alarm.feed(time_ns, column, column, 'm')
     if shelved:
         assert alarm.operate(AlarmAction.SHELVE, int(time_ns[-1]), 'm')[0]
-    monitor = SimpleNamespace(alarm=alarm, judged=Judged(0, values[-1], values[-1]))
-    return alarm_item(monitor)
+    judged = Judged(0, values[-1], values[-1])
+    return alarm_item(SimpleNamespace(alarm=alarm, judged=judged, characteristic=curve))
 
 
 def test_diagnostics_tell_states_that_no_announcement_told():
@@ -439,3 +439,4 @@ def test_diagnostics_tell_states_that_no_announcement_told():
     assert (blind.level, blind.values['State']) == (Level.WARN, 'suppressed')
     assert 'no alarm can come' in blind.sentence
     assert after([0.0]).level == Level.OK
+    assert 'without a curve none can come' in after([0.0], curve=None).sentence

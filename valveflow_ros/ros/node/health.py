@@ -264,7 +264,9 @@ class InputHealth:
             return Level.OK, f'Waiting for {topic}.'
         if seen.right:
             return Level.STALE, f'{topic} has a publisher, but nothing has come from it yet.'
-        return Level.STALE, f'Nobody publishes {topic}; remap it, or start the gateway.'
+        all_in_one = '' if name == PLANT_SAMPLE else f' or {self._topics[PLANT_SAMPLE]}'
+        told = f'Nobody publishes {topic}{all_in_one}; remap it, or start the gateway.'
+        return Level.STALE, told
 
     def _why(self, info: SignalInfo, counts: Mapping[str, int]) -> str:
         """Return why readings were rejected: the last impossible value, or counts by reason."""
@@ -423,6 +425,8 @@ def alarm_item(monitor: Monitor) -> Item:
         **_count_values(alarm),
     }
     level, sentence = Level.OK, 'No alarm.'
+    if monitor.characteristic is None:
+        sentence = 'No alarm; without a curve none can come.'
     if alarm.active:
         level = Level.WARN if alarm.state in _ASIDE else Level.ERROR
         sentence = f'The unit does not follow its curve ({words}).'
