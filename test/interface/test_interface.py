@@ -118,6 +118,20 @@ class TestLog:
         )
         assert back['main_steam_temperature_degc'].tolist() == pytest.approx([540.0] * 100)
 
+    @pytest.mark.parametrize(('unit', 'asks'), [('', True), (':MW', False), (':t/h', False)])
+    def test_an_output_without_unit_beside_a_constant_pressure_may_be_a_flow(
+        self, simulation, unit, asks
+    ):
+        frame = simulation.to_dataframe().head(100).drop(columns='main_steam_pressure_mpa')
+        frame['FT'], heard = frame.pop('generated_power_mw'), Heard()
+        heard.warn = heard.said.append
+        vf.open_log(
+            frame, columns={'generated_power': f'FT{unit}'},
+            constants={'main_steam_pressure': 1.0}, progress=heard,
+        )  # fmt: skip
+        told = [s for s in heard.said if '--column generated_power=FT:t/h' in s]
+        assert len(told) == asks
+
     def test_a_file_and_its_dataframe_are_the_same_log(self, simulation, tmp_path):
         write_table(simulation.data.table.part(0, 1000), tmp_path / 'a.parquet')
         frame = pd.read_parquet(tmp_path / 'a.parquet')

@@ -22,7 +22,7 @@ from valveflow_ros.logs import open_log as read_file
 from valveflow_ros.logs.names import signal_of
 from valveflow_ros.logs.reader import TABLE_SUFFIXES
 from valveflow_ros.logs.tables.cells import QUALITY_SUFFIX
-from valveflow_ros.logs.tables.match import TIME
+from valveflow_ros.logs.tables.match import TIME, option
 from valveflow_ros.logs.tables.reader import TableReader
 from valveflow_ros.logs.tables.refusal import quoted
 from valveflow_ros.parameters import PARAMETERS, Settings
@@ -503,6 +503,13 @@ def _understood(
         progress.warn(
             f"{SIGNALS[signal].topic} stands in the log as '{contents.signals[signal]}' too; "
             'the constant is used instead.'
+        )
+    power, pressure = Signal.GENERATED_POWER, Signal.MAIN_STEAM_PRESSURE
+    if steam and pressure in constants and power not in told and power in mapping.unsaid(units):
+        theirs = contents.signals.get(power, 'COLUMN')
+        progress.warn(
+            f"'{theirs}' is taken as a power in MW. If it is a flow, add its unit: "
+            f'{option("generated_power", theirs, "t/h")}'
         )
     measured = _converted(raw, units)
     compression = find_compression(measured)
