@@ -241,6 +241,11 @@ def test_what_endangers_the_answer_stands_beside_it(identified, monkeypatch):
     assert doubt(identified) == ''
     flat = with_curve(identified, pieces=tuple(replace(p, slope=1e-6) for p in c.pieces))
     assert 'it explains only' in doubt(flat)
+    monkeypatch.setattr('valveflow_ros.report.answer.explained', lambda _: 0.7)
+    for error, words in ((0.04, 'The slopes are known within 10 %.'), (0.06, 'Do not rely'),
+                         (float('nan'), 'Do not rely')):  # fmt: skip
+        pieces = tuple(replace(p, slope_stderr=error * p.slope) for p in c.pieces[:1])
+        assert words in doubt(with_curve(identified, pieces=pieces, breakpoint_intervals=()))
     monkeypatch.setattr('valveflow_ros.report.answer.explained', lambda _: 0.99)
     assert 'the power follows the pressure alone' in doubt(flat)
 

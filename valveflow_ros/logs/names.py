@@ -47,15 +47,20 @@ def last_part(topic: str) -> str:
 
 
 def told_inputs(attachments: Mapping[str, bytes]) -> dict[str, str]:
-    """Return the topic of each input that the monitor of a recording names, by contract name."""
+    """Return the topic of each input that the monitor of a recording names, by input name.
+
+    It is empty for other recordings. A covariate is an input too.
+    """
     try:
         told = json.loads(attachments[TOPICS])['inputs'].items()
     except (KeyError, ValueError, TypeError, AttributeError):
         return {}
-    return {
-        name: topic for name, topic in told
-        if isinstance(topic, str) and (name in _TOPICS or name == PLANT_SAMPLE_TOPIC)
-    }  # fmt: skip
+    return {name: str(topic) for name, topic in told}
+
+
+def is_input(name: str) -> bool:
+    """Return True for the topic name of a signal or of a PlantSample."""
+    return name in _TOPICS or name == PLANT_SAMPLE_TOPIC
 
 
 def has_earlier_codes(definition: str) -> bool:

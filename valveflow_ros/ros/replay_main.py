@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,7 @@ from rclpy.utilities import remove_ros_args
 
 from valveflow_ros.errors import DataError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, open_log
-from valveflow_ros.logs.names import TOPICS, has_earlier_codes
+from valveflow_ros.logs.names import has_earlier_codes, told_inputs
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.progress import Progress
 from valveflow_ros.report.terminal.text import number
@@ -82,10 +81,9 @@ def input_topics(log: LogContents) -> dict[str, str]:
     A recording of the monitor states which of its topics were inputs; a covariate keeps its
     topic. In other recordings inputs are recognised by topic name and type.
     """
-    try:
-        told = json.loads(log.attachments[TOPICS])['inputs']
-        known = {str(t): str(name if name in INPUT_BY_NAME else t) for name, t in told.items()}
-    except (KeyError, ValueError, TypeError, AttributeError):
+    told = told_inputs(log.attachments)
+    known = {topic: name if name in INPUT_BY_NAME else topic for name, topic in told.items()}
+    if not known:
         known = {topic: SIGNALS[signal].topic for signal, topic in log.signals.items()}
         for topic, info in log.topics.items():
             if info.type == INPUT_BY_NAME[PLANT_SAMPLE].type_name:

@@ -20,6 +20,7 @@ from valveflow_ros.logs.mcap.scan import Scanner, scan_warnings, why_empty
 from valveflow_ros.logs.names import (
     PLANT_SAMPLE_TOPIC,
     TopicChoice,
+    is_input,
     last_part,
     misfits,
     told_inputs,
@@ -158,8 +159,8 @@ def read_recording(paths: list[Path], name: str, columns: Mapping[str, str]) -> 
         attachments |= {found.name: found.data for found in file.findings.attachments}
     remapped = {
         signal: topic for signal, topic in told_inputs(attachments).items()
-        if topic in types and last_part(topic) != signal and signal not in columns
-        and topic not in columns.values()
+        if is_input(signal) and topic in types and last_part(topic) != signal
+        and signal not in columns and topic not in columns.values()
     }  # fmt: skip
     if remapped:
         # What these topics hold was not kept at the first reading.
