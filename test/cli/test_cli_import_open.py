@@ -77,6 +77,20 @@ def test_what_was_said_before_stands_in_the_command_too(run, table):
     assert run(*words).status == 0
 
 
+def test_a_valve_with_opening_and_flow_only_gets_a_command_that_works(run, tmp_path):
+    path = tmp_path / 'loop.csv'
+    rows = [f'2026-01-01T{k // 60:02}:{k % 60:02}:00,{40 + k % 7},{90 + k % 9}' for k in range(N)]
+    path.write_text('\n'.join(['time,FV101.OP (%),FT101 (t/h)', *rows]) + '\n')
+    said = run('import', path, '--dry-run').refused()
+    ran = run(*last_command(said)).done()
+    assert '1.000 MPa' in ran.out and '540.0 degC' in ran.out
+    # With a pressure in the table, a constant one is not proposed.
+    path.write_text(path.read_text().replace('t/h)\n', 't/h),P1 (bar),P2 (bar)\n', 1))
+    assert (
+        'main_steam_pressure=1' not in run('import', path, '--dry-run').refused().splitlines()[-1]
+    )
+
+
 def test_what_only_the_person_knows_is_left_to_be_filled_in(run, table, tmp_path):
     table.write_text(table.read_text().replace('Steam temp', 'X1').replace('Gross MW', 'X2'))
     said = run('import', table, '-o', tmp_path / 'x.mcap').refused()

@@ -288,4 +288,5 @@ def merge_refusals(
 
 def subject(remedy: Remedy) -> str:
     """Return the subject of an option: a later option with the same subject replaces it."""
-    return remedy.value.partition('=')[0].strip() if remedy.option == 'column' else remedy.option
+    of_signal = remedy.option in ('column', 'constant')
+    return remedy.value.partition('=')[0].strip() if of_signal else remedy.option

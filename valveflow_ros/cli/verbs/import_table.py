@@ -300,7 +300,7 @@ def _refusal(refused: RefusedError, options: Namespace) -> str:
     if any(r.value.endswith(f'={THEIRS}') for r in refused.remedies):
         checks.append(f'with your names in place of {THEIRS}')
     if any(r.option == 'constant' for r in refused.remedies):
-        checks.append('with an assumed temperature: check it')
+        checks.append('with assumed constant values: check them')
     if any(r.option in _CHOICES for r in refused.remedies) or ' or --' in refused.listing:
         checks.append('with the first of each choice: check it')
     head = ', '.join(['Then this reads it', *checks])
@@ -340,4 +340,4 @@ def _subject(remedy: Remedy) -> str:
 
     if remedy.option == 'column':
         return next(iter(read_mapping([remedy.value], []).columns))
-    return subject(remedy) if remedy.option != 'constant' else remedy.value
+    return subject(remedy)

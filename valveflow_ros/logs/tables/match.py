@@ -188,7 +188,7 @@ class Matcher:
                 f'{", ".join(told)}; the {self.what}s are: {self._have(chosen)}. Name '
                 f'yours with {options}{constant}{apart}'
             )
-        remedies += [_naming(topic) for topic in topics if topic != TIME]
+        remedies += [self._naming(topic) for topic in topics if topic != TIME]
         remedies += [] if no_time is None else [no_time]
         return RefusedError(self.path, '; '.join(parts), remedies)
 
@@ -208,6 +208,20 @@ class Matcher:
         elif topic in missing:
             added.append(option(topic, THEIRS, 't/h'))
         return f'; for a control valve with opening and flow only, add {" ".join(added)}'
+
+    def _naming(self, topic: str) -> Remedy:
+        """Return the option for a signal that was not found.
+
+        The temperature is often not recorded, and beside a flow neither is the pressure.
+        """
+        if topic == SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic:
+            return Remedy('constant', f'{topic}={_USUAL_DEGC}')
+        steam = Signal.MAIN_STEAM_PRESSURE
+        if topic == SIGNALS[steam].topic and any(map(words.flow_spelled, self._units)):
+            places = range(len(self.names))
+            if not any(self._may_be(steam, k) for k in places):
+                return Remedy('constant', f'{topic}=1')
+        return choosing(topic, THEIRS)
 
     def missing(self, theirs: str, name: str) -> RefusedError:
         """Return the error for a time column that the user named and that does not exist."""
@@ -254,11 +268,6 @@ def option(topic: str, theirs: str, unit: str = '') -> str:
     return str(choosing(topic, theirs, unit))
 
 
-def _naming(topic: str) -> Remedy:
-    """Return the option for a signal that was not found; the temperature is often not recorded."""
-    if topic == SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic:
-        return Remedy('constant', f'{topic}={_USUAL_DEGC}')
-    return choosing(topic, THEIRS)
 
 
 def choosing(topic: str, theirs: str, unit: str = '') -> Remedy:
