@@ -106,7 +106,7 @@ def gallery() -> str:
                 else caption
             )
     parts = ['# Gallery\n', '[The examples in Python](notebook.md).\n']
-    parts += [f'![{name}](pictures/{name})\n\n{captions[name]}\n' for name in sorted(captions)]
+    parts += [f'## {captions[name]}\n\n![](pictures/{name})\n' for name in sorted(captions)]
     return '\n'.join(parts)
 
 

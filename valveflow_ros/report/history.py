@@ -462,7 +462,7 @@ def curve_history_figure(history: History) -> Figure:
     first, last = history.curves[0], history.curves[-1]
     layout: Spec = {
         'xaxis': plot.time_axis(anchor='y2'),
-        'yaxis': plot.axis('power less<br>usual (MW)', domain=[0.5, 1.0]),
+        'yaxis': plot.axis('power against<br>the last (MW)', domain=[0.5, 1.0]),
         'yaxis2': plot.axis(
             f'breakpoints<br>u ({say.input_unit(last.exponent)})', domain=[0.0, 0.42]
         ),
@@ -470,10 +470,9 @@ def curve_history_figure(history: History) -> Figure:
     }
     caption = (
         '<b>Flat lines: the valve is as it was. A step: something happened then. A slope: it '
-        'wears.</b> Above, what each curve gives at five inputs, less the median of all curves '
-        'there; a line begins where the first curve that reaches so far was found. Below, where '
-        'the breakpoints lie, with their 95 % intervals. The first curves rest on few data and '
-        'may jump.'
+        'wears.</b> Above, by how many MW each curve lies above the last one at five inputs; a line '
+        'begins where the first curve that reaches so far was found. Below, where the breakpoints '
+        'lie, with their 95 % intervals. The first curves rest on few data and may jump.'
     )
     words = (
         f'{say.counted(len(history.curves), "curve")} over '
@@ -492,12 +491,10 @@ def _power_lines(history: History) -> list[Spec]:
     at = plot.moments([t / 1e6 for t in (*times, max(history.end_ns, times[-1]))])
     traces = []
     for x, values, (colour, sign) in zip(u, powers(history.curves, u).T, _LOOKS, strict=True):
-        known = values[np.isfinite(values)]
-        usual = float(np.median(known)) if len(known) else float('nan')
-        off = np.append(values, values[-1]) - usual
+        off = np.append(values, values[-1]) - values[-1]
         traces.append(plot.line(
             at, plot.rounded(off), f'u = {x:.0f}', colour,
-            f'{DAY_HOUR}u = {x:.0f}, usual {usual:.1f} MW<br>%{{y:+.2f}} MW<extra></extra>',
+            f'{DAY_HOUR}u = {x:.0f}, the last {values[-1]:.1f} MW<br>%{{y:+.2f}} MW<extra></extra>',
             width=1.8, shape='hv', mode='lines+markers',
             marker={'color': plot.token(colour), 'size': 7, 'symbol': sign},
         ))  # fmt: skip
