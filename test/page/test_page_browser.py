@@ -106,7 +106,7 @@ def test_it_updates_itself_and_stays_where_it_was_scrolled_to(serve, browser, un
         predict(unit, k, measured=260.0)
     shown.put([unit.snapshot(unit.frame('m'))])
     has(browser, 'alarm, acknowledged')
-    until(browser, f'{day}.data[3].y.length', 6)
+    until(browser, f'{day}.data[2].y.length', 6)
     assert browser.ask(shown_from) == scrolled
     shown.put([unit.snapshot(unit.frame('m', 'The monitor has gone.'), present=False)])
     has(browser, 'no monitor')
