@@ -104,8 +104,9 @@ def _others(shift: Shift, numbers: list[int], curve: Characteristic) -> str:
     for k in numbers:
         p = shift.pieces[k - 1]
         place = curve.place_words(p.u_from, p.u_to)
-        told.append(f'at {place} (piece {k}) by {short(p.shift_mw, 1, "+")} MW')
-    return f' It has changed {", ".join(told)} too.'
+        side = 'more' if p.shift_mw > 0.0 else 'less'
+        told.append(f'{short(abs(p.shift_mw), 1)} MW {side} at {place} (piece {k})')
+    return f' It also gives {", ".join(told)}.'
 
 
 # The errors of curves assume uniform samples over a piece and noise with a short correlation

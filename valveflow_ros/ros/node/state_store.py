@@ -283,11 +283,11 @@ class StateStore:
         self.saved = None
         self.lost = not whole
         stays = self._folder is not None and self._folder.set_aside()
-        kept = 'It stays beside the new one' if stays else f'It is not kept beside {ASIDE}'
+        kept = f'It is kept as {ASIDE}' if stays else f'It is not kept: {ASIDE} holds a larger one'
         then = (
             f'{kept}, and a run with the same settings will use it.' if whole and stays else
-            f'{kept}. Window, standing alarms and reference of before are '
-            'gone; curves of before stand there as curve_*.json, for reference_file.'
+            f'{kept}. Its window, active alarms and reference are not used; its curves are in the '
+            'same folder as curve_*.json, for reference_file.'
         )  # fmt: skip
         self.sentence = f'The state saved by an earlier run is not used. {reason} {then}'
 
