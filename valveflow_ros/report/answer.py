@@ -60,10 +60,12 @@ def doubt(data: Identified) -> str:
             'within 10 %.'
         )
     if misfit is not None:
-        told.append(
-            f'Do not rely on this curve: it is wrong by {misfit_words(misfit)}. The power depends '
-            'on opening and pressure in another way, or on something that was not logged.'
-        )
+        told.append(f'Do not rely on this curve: it is wrong by {misfit_words(misfit)}.')
+        if not data.mixture:
+            told.append(
+                'The power depends on opening and pressure in another way, or on something that '
+                'was not logged.'
+            )
     if form := wrong_form(data.characteristic):
         told.append(form)
     return ' '.join(told)
