@@ -275,6 +275,12 @@ class _Rest:
     start_ns: int = 0
 
     @property
+    def left_mw2(self) -> float:
+        """Return the variance that still depends on a variable or repeats with a period."""
+        structure = self.structure.explained_mw2 if self.structure.there else 0.0
+        return max(structure, self.period.variance_mw2 if self.period.there else 0.0)
+
+    @property
     def disturbance(self) -> Disturbance | None:
         """Return the slow disturbance of the power; None if there is none."""
         slow, course = self.drift, self.course
@@ -672,7 +678,8 @@ def _conclude(
         verdict=verdict, sentence='', causes=earlier + causes + outside,
         not_told_apart=near, experiments=_experiments(earlier + causes),
         disturbance=rest.disturbance,
-        unexplained_by=unexplained, rejected=tuple(found.reasons.items()),
+        unexplained_by=unexplained, unexplained_mw=math.sqrt(rest.left_mw2),
+        rejected=tuple(found.reasons.items()),
         rmse_simulation=before, rmse_extended=after,
         rmse_noise_floor=noise_floor(found.task, models[-1], explained),
         segments=by_segment(found.task, simulation, models[-1], record.spans_ns),
@@ -730,11 +737,7 @@ def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str,
 
     If the remaining structure exceeds what the causes explain, they are only approximate.
     """
-    left = 0.0
-    if rest.structure.there:
-        left = max(left, rest.structure.explained_mw2)
-    if rest.period.there:
-        left = max(left, rest.period.variance_mw2)
+    left = rest.left_mw2
     if left > 0.0:
         rows = found.task.rows
         own = float(
@@ -809,6 +812,7 @@ def _sentence(d: Diagnosis) -> str:
     names = listed([_IN_WORDS.get(name, name) for name in d.unexplained_by])
     return (
         f'{first}Measured and simulated power {"still " if first else ""}differ by '
-        f'{d.rmse_extended:.2g} MW (root mean square). Part of this depends on {names}, and no '
-        f'cause of the catalogue explains it.{wander}{near}{but}{besides}'
+        f'{d.rmse_extended:.2g} MW (root mean square). Of this about '
+        f'{d.unexplained_mw:.2g} MW depends on {names}, and no cause of the catalogue explains '
+        f'it.{wander}{near}{but}{besides}'
     )

@@ -128,6 +128,8 @@ class Diagnosis:
         Experiments that would distinguish them.
     disturbance : Disturbance or None
     unexplained_by : tuple of str
+    unexplained_mw : float
+        Root mean square of what these variables explain, without the time.
     rejected : tuple of (name, reason)
     rmse_simulation, rmse_extended, rmse_noise_floor : float
         MW, RMSE on sealed blocks of means over ``mean_s``.
@@ -149,6 +151,7 @@ class Diagnosis:
     experiments: tuple[str, ...]
     disturbance: Disturbance | None
     unexplained_by: tuple[str, ...]
+    unexplained_mw: float
     rejected: tuple[tuple[str, str], ...]
     rmse_simulation: float
     rmse_extended: float

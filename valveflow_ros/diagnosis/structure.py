@@ -11,7 +11,7 @@ into the opening; therefore innovations are used, which are independent of the p
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -29,6 +29,7 @@ _FINE, _MEDIUM, _COARSE, _TRIPLE, _RIPPLE = 24, 8, 4, 4, 48
 _SHRINK = (4.0, 30.0)
 _LAGS = 60
 _ENOUGH = 0.75
+_RESPONSE = 500  # means, of the noise model's answer to one innovation
 _IN_TRIPLES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 
 
@@ -175,34 +176,52 @@ def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) ->
     """Return the table with the largest gain, or a nearly equal one with fewer variables."""
     white = np.zeros(len(series))
     white[task.rows] = task.innovations(series)
-    rest, good, block, _ = minutes(task, white)
+    rest, good, block, rows = minutes(task, white)
     values = {n: v for n, v in values.items() if np.std(v[good]) > 1e-9}
     good &= block % FOLDS != SEALED_FOLD
     wide = inflation(rest, good.astype(np.uint8), _LAGS)
     noise = float(np.var(rest[good])) * wide
-    # Whitening reduces effects that last for minutes; this factor corrects for it.
-    again = 1.0 / max(1.0 - float(task.ar.sum()), 0.05) ** 2
     fold, at = block[good] % FOLDS, block[good]
-    tried = []
+    tried: list[tuple[Structure, np.ndarray]] = []
     for names, cell in _tables(values, good):
         for shrink in _SHRINK:
             gain = _held_out(cell[good], rest[good], fold, shrink * wide)
             by_block = np.bincount(at, gain)[np.bincount(at) > 0]
             spread = float(by_block.std(ddof=1)) * np.sqrt(len(by_block))
-            tried.append(
-                Structure(
-                    names, float(gain.sum()) / (2.0 * noise),
-                    float(by_block.sum() / spread) if spread > 0.0 else 0.0,
-                    float(gain.mean()) * again,
-                )
-            )  # fmt: skip
-    best = max(tried, key=lambda s: s.gain)
-    if not best.gain > 0.0:
-        return best
-    # The fewest variables that do nearly as well.
-    good_ones = [s for s in tried if s.gain >= _ENOUGH * best.gain]
-    fewest = min(len(s.variables) for s in good_ones)
-    return max((s for s in good_ones if len(s.variables) == fewest), key=lambda s: s.gain)
+            sign = float(by_block.sum() / spread) if spread > 0.0 else 0.0
+            found = Structure(names, float(gain.sum()) / (2.0 * noise), sign, float(gain.mean()))
+            tried.append((found, cell))
+    best = max(tried, key=lambda each: each[0].gain)
+    if best[0].gain > 0.0:
+        # The fewest variables that do nearly as well.
+        good_ones = [each for each in tried if each[0].gain >= _ENOUGH * best[0].gain]
+        fewest = min(len(s.variables) for s, _ in good_ones)
+        best = max(
+            (e for e in good_ones if len(e[0].variables) == fewest), key=lambda e: e[0].gain
+        )
+    found, cell = best
+    count = np.bincount(cell[good], minlength=int(cell.max()) + 1)
+    level = np.bincount(cell[good], rest[good], len(count)) / np.maximum(count, 1)
+    lost = _whitening_loss(level[cell], good, rows, task.ar)
+    return replace(found, explained_mw2=found.explained_mw2 * lost)
+
+
+def _whitening_loss(effect: FloatArray, good: BoolArray, rows: int, ar: FloatArray) -> float:
+    """Return the variance of an effect over that of its innovations, from the innovations.
+
+    Whitening keeps the size of an effect that comes and goes within the correlation time of the
+    noise, and reduces one that lasts.
+    """
+    response = np.zeros(_RESPONSE)
+    response[0] = 1.0
+    for t in range(1, _RESPONSE):
+        back = response[max(t - len(ar), 0) : t][::-1]
+        response[t] = float(ar[: len(back)] @ back)
+    m = len(effect)
+    whole = np.convolve(np.repeat(effect, rows), response)[: m * rows]
+    whole = whole.reshape(m, rows).mean(axis=1)
+    small = float(np.var(effect[good]))
+    return float(np.var(whole[good])) / small if small > 0.0 else 1.0
 
 
 # A hidden period: one line of the residual spectrum far above its neighbours.
