@@ -470,9 +470,9 @@ def curve_history_figure(history: History) -> Figure:
     }
     caption = (
         '<b>Flat lines: the valve is as it was. A step: something happened then. A slope: it '
-        'wears.</b> Above, by how many MW each curve lies above the last one at five inputs; a line '
-        'begins where the first curve that reaches so far was found. Below, where the breakpoints '
-        'lie, with their 95 % intervals. The first curves rest on few data and may jump.'
+        'wears.</b> Above, by how many MW each curve lies above the last one at five inputs; a '
+        'line begins where the first curve that reaches so far was found. Below, where the '
+        'breakpoints lie, with their 95 % intervals. The first curves rest on few data and may jump.'
     )
     words = (
         f'{say.counted(len(history.curves), "curve")} over '
@@ -494,7 +494,7 @@ def _power_lines(history: History) -> list[Spec]:
         off = np.append(values, values[-1]) - values[-1]
         traces.append(plot.line(
             at, plot.rounded(off), f'u = {x:.0f}', colour,
-            f'{DAY_HOUR}u = {x:.0f}, the last {values[-1]:.1f} MW<br>%{{y:+.2f}} MW<extra></extra>',
+            f'{DAY_HOUR}u = {x:.0f}, last {values[-1]:.1f} MW<br>%{{y:+.2f}} MW<extra></extra>',
             width=1.8, shape='hv', mode='lines+markers',
             marker={'color': plot.token(colour), 'size': 7, 'symbol': sign},
         ))  # fmt: skip

@@ -268,8 +268,6 @@ def option(topic: str, theirs: str, unit: str = '') -> str:
     return str(choosing(topic, theirs, unit))
 
 
-
-
 def choosing(topic: str, theirs: str, unit: str = '') -> Remedy:
     """Return the option that selects a column."""
     return Remedy('column', f'{topic}={theirs}' + (f':{unit}' if unit else ''))
