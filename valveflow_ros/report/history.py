@@ -472,7 +472,8 @@ def curve_history_figure(history: History) -> Figure:
         '<b>Flat lines: the valve is as it was. A step: something happened then. A slope: it '
         'wears.</b> Above, by how many MW each curve lies above the last one at five inputs; a '
         'line begins where the first curve that reaches so far was found. Below, where the '
-        'breakpoints lie, with their 95 % intervals. The first curves rest on few data and may jump.'
+        'breakpoints lie, with their 95 % intervals. The first curves rest on few data and may '
+        'jump.'
     )
     words = (
         f'{say.counted(len(history.curves), "curve")} over '
