@@ -26,6 +26,7 @@ from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, caus
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
+from valveflow_ros.diagnosis.structure import structure, variables
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -226,6 +227,24 @@ def test_every_fifth_block_is_sealed_and_in_no_fit(grids):
     assert not np.any(grids.open_rows & grids.sealed_rows)
     assert np.array_equal(grids.open_rows | grids.sealed_rows, grids.whole)
     assert set(grids.fold_of_sub[grids.sub[grids.sealed_rows]]) == {SEALED_FOLD}
+
+
+@pytest.mark.parametrize('variable', ['ramp', 'u'])
+def test_the_size_of_a_remaining_structure_is_that_of_the_effect(grids, variable):
+    # Noise that lasts for minutes, and an effect that comes and goes or lasts for hours.
+    plain, ar = Extended(rough_model()), np.array([0.95, 0.0, 0.0, 0.0])
+    task = Task(grids, grids.open_rows, ar)
+    x = np.repeat(variables(task, plain)[variable], 6)
+    x = np.concatenate([x, np.full(len(grids.power) - len(x), x[-1])])
+    effect = 1.5 * np.sign(x - np.median(x[grids.open_rows]))
+    noise = np.random.default_rng(5).normal(0.0, 0.1, len(x))
+    for k in range(1, len(noise)):
+        noise[k] += 0.95 * noise[k - 1]
+    seen = Task(replace(grids, power=answer(grids, plain) + effect + noise), task.rows, ar)
+    found = structure(seen, plain)
+    assert variable in found.variables
+    true_mw2 = float(np.var(effect[grids.open_rows]))
+    assert 0.3 * true_mw2 < found.explained_mw2 < 2.0 * true_mw2
 
 
 def test_scores_of_noise_have_even_chances():
