@@ -127,6 +127,8 @@ def test_empty_and_read_only_arrays():
         ('0.5 MPa/MW; 2 MW/(10 d); MW per unit', '0.5 MPa/(t/h); 2 (t/h)/(10 d); t/h per unit'),
         ('the generated power, {"power": "power"}', 'the flow, {"power": "flow"}'),
         ('Generated power of generated_power, rmse_mw', 'Flow of generated_power, rmse_mw'),
+        ('load (MW); at one load, all the loads seen; a workload, load the log',
+         'flow (t/h); at one flow, all the flows seen; a workload, load the log'),
         ("power.csv, 'Power [t/h]', --column generated_power=MW_GROSS:MW", ''),
         ('GENERATED_POWER_MW of 12MW, MWh, powerful', ''),
     ],

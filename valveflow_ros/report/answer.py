@@ -15,7 +15,7 @@ from valveflow_ros.fit.model_form import Misfit
 from valveflow_ros.fit.result import forms_apart, is_borrowed, wrong_form
 from valveflow_ros.fit.static_test import STATIC_RULE
 from valveflow_ros.fit.step_test import RULE
-from valveflow_ros.records import FloatArray, Signal
+from valveflow_ros.records import FLOW_UNITS, FloatArray, Signal
 from valveflow_ros.report import figure as plot
 from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
@@ -209,7 +209,8 @@ def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of MW per % of opening by load."""
     unit, gains = data.characteristic.output_unit, gain_by_load(data)
     digits = 1 if all(g.pressure_high > _SMALL_MPA for g in gains) else 3
-    head = [f'load ({unit})', 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
+    load = 'flow' if unit in FLOW_UNITS else 'load'
+    head = [f'{load} ({unit})', 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
             f'{unit} per 1 % of opening', '95 % interval', 'over that range']  # fmt: skip
     cells = [
         [

@@ -10,6 +10,7 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.static_test import STATIC_RULE
 from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.parameters import PARAMETERS, Settings
+from valveflow_ros.records import FLOW_UNITS
 from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import (
@@ -56,7 +57,8 @@ def identification_page(data: Identified) -> Page:
     c = data.characteristic
     tag = data.settings.text('unit_tag')
     named = tag != PARAMETERS['unit_tag'].default
-    title = f'Flow characteristic of {tag}' if named else 'Main steam valve flow characteristic'
+    of_steam = 'Valve' if c.output_unit in FLOW_UNITS else 'Main steam valve'
+    title = f'Flow characteristic of {tag}' if named else f'{of_steam} flow characteristic'
     times = say.period(c.source.window_start_ns, c.source.window_end_ns)
     sections = [
         html.section(

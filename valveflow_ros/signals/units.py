@@ -99,6 +99,8 @@ _OUTPUT_WORDS = re.compile(
     r"""|(?P<made>[Gg]enerated )?(?<!/)(?P<power>[Pp]owers?))(?!\w|[.=:-]\w|"\s*:)"""
 )
 
+_LOADS = re.compile(r'\b((?:at|each|full|of|one|several|that|the|this) )load(s?)\b|^load(?= \()')
+
 
 def in_unit(text: str, unit: str) -> str:
     """Return a sentence or page about power in MW as one about a flow in ``unit``.
@@ -117,6 +119,7 @@ def in_unit(text: str, unit: str) -> str:
         divides = found.start() > 0 and found.string[found.start() - 1] == '/'
         return f'({unit}){more}' if divides or more else unit
 
+    text = _LOADS.sub(lambda found: f'{found[1] or ""}flow{found[2] or ""}', text)
     return _OUTPUT_WORDS.sub(told, text)
 
 
