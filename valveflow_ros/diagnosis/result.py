@@ -128,8 +128,6 @@ class Diagnosis:
         Experiments that would distinguish them.
     disturbance : Disturbance or None
     unexplained_by : tuple of str
-    unexplained_mw : float
-        Root mean square of what these variables explain, without the time.
     rejected : tuple of (name, reason)
     rmse_simulation, rmse_extended, rmse_noise_floor : float
         MW, RMSE on sealed blocks of means over ``mean_s``.
@@ -142,6 +140,8 @@ class Diagnosis:
         Reference values of its causes.
     notes : tuple of str
     mean_s : float
+    unexplained_mw : float
+        Root mean square of what ``unexplained_by`` explains, without the time.
     """
 
     verdict: str
@@ -151,7 +151,6 @@ class Diagnosis:
     experiments: tuple[str, ...]
     disturbance: Disturbance | None
     unexplained_by: tuple[str, ...]
-    unexplained_mw: float
     rejected: tuple[tuple[str, str], ...]
     rmse_simulation: float
     rmse_extended: float
@@ -163,6 +162,7 @@ class Diagnosis:
     reference: Reference
     notes: tuple[str, ...] = ()
     mean_s: float = MEAN_S
+    unexplained_mw: float = 0.0
 
     def measured_in(self, unit: str) -> Diagnosis:
         """Return the same numbers and sentences in ``unit`` of the output."""
