@@ -23,7 +23,7 @@ from valveflow_ros.curve.segment_residual import (
     scan,
     segment_residuals,
 )
-from valveflow_ros.errors import DataError, short
+from valveflow_ros.errors import DataError, listed, short
 from valveflow_ros.records import NS_PER_S, FloatArray, IntArray, SpecialSegment
 
 _SURE = 0.9999
@@ -106,7 +106,7 @@ def _others(shift: Shift, numbers: list[int], curve: Characteristic) -> str:
         place = curve.place_words(p.u_from, p.u_to)
         side = 'more' if p.shift_mw > 0.0 else 'less'
         told.append(f'{short(abs(p.shift_mw), 1)} MW {side} at {place} (piece {k})')
-    return f' It also gives {", ".join(told)}.'
+    return f' The unit also gives {listed(told)}.'
 
 
 # The errors of curves assume uniform samples over a piece and noise with a short correlation
@@ -117,10 +117,11 @@ _PROFILE = 101  # points along a piece
 # Limits of p-value and standard errors for reporting a change within the data of a curve. In one
 # piece it must also be larger than this fraction of the power's range: in 30 healthy units with
 # weather (8001 to 8010 of three kinds, seven days of means over a minute) the means of a piece
-# changed by up to 3.8 MW, and by up to 5.1 standard errors. With these limits none was told in 54
-# records of the units 8102 to 8110, whose power had a range of 93 to 193 MW.
+# changed by up to 3.8 MW. With these limits none was told there, nor in 54 records of the units
+# 8102 to 8110; their power had a range of 93 to 193 MW.
 _MIXED_CHANCE, _MIXED_ERRORS = 1e-4, 3.0
 _MIXED_ERRORS_OF_PIECE, _MIXED_LEAST = 4.0, 0.025
+_HALF_DAY_NS, _LEAST_HALF_DAYS = 43_200 * NS_PER_S, 4
 _TESTS = 2  # each piece is tested by the curves and by its segments
 
 
@@ -264,24 +265,32 @@ def judge_shift(
 def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) -> str:
     """Return a sentence if the unit changed within the data of a curve, of these segments.
 
-    The mean over all loads is tested first, then each piece: a valve that fails changes only the
-    loads that need it.
+    The mean over all loads is tested, and each piece: a valve that fails changes only the loads
+    that need it.
     """
     found = segment_residuals(curve, segments)
     wander_mw, pieces = curve.residuals.wander_mw, curve.pieces
-    change = _change_within(found, wander_mw, _MIXED_CHANCE)
-    if change is not None and change[1] > _MIXED_ERRORS:
-        return _mixture_words(change, '(mean over the loads seen)')
+    whole = _change_within(found, wander_mw, _MIXED_CHANCE)
+    if whole is not None and not whole[1] > _MIXED_ERRORS:
+        whole = None
     shown = curve.at_pressure(curve.shown_at_mpa)
     least_mw = _MIXED_LEAST * float(np.ptp(shown.model.static(shown.breakpoints)))
-    told = []
+    told: list[tuple[float, int, str]] = []
+    tested = 0
     for index, piece in enumerate(pieces, 1):
         there = found.inside(piece.u_from, piece.u_to)
+        tested += len(there) >= 2 * LEAST_SIDE
         change = _change_within(there, wander_mw, _MIXED_CHANCE / len(pieces), own=True)
         if change is not None and abs(change[0]) > least_mw and change[1] > _MIXED_ERRORS_OF_PIECE:
             place = f'at {curve.place_words(piece.u_from, piece.u_to)} (piece {index})'
-            told.append((change[1], _mixture_words(change, place)))
-    return max(told)[1] if told else ''
+            told.append((change[1], change[2], _moved(change[0], place)))
+    if told and (whole is None or len(told) < tested):
+        told.sort(reverse=True)
+        # The piece that the unit visited first after the change dates it best.
+        return _mixture_words(min(since for _, since, _ in told), listed([w for *_, w in told]))
+    if whole is None:
+        return ''
+    return _mixture_words(whole[2], _moved(whole[0], '(mean over the loads seen)'))
 
 
 def _change_within(
@@ -289,8 +298,8 @@ def _change_within(
 ) -> tuple[float, float, int] | None:
     """Return a change of the mean: MW, its size in standard errors, onset; None if it is chance.
 
-    With ``own`` the slow variation is at most that around the two means: the ``wander_mw`` of a
-    curve that is a mixture contains the change.
+    With ``own`` the slow variation is at most that of half days about the two means: the
+    ``wander_mw`` of a curve that is a mixture contains the change.
     """
     change = scan(found.residual_mw, found.weights)
     if change is None or change.p_value > chance:
@@ -298,8 +307,9 @@ def _change_within(
     time_ns, weights, place = found.time_ns, found.weights, change.place
     if own:
         means = np.where(np.arange(len(found)) < place, change.before, change.after)
-        rest = float(np.average((found.residual_mw - means) ** 2, weights=weights))
-        wander_mw = float(np.fmin(wander_mw, math.sqrt(rest)))
+        wander_mw = float(
+            np.fmin(wander_mw, _slow_sd(time_ns, found.residual_mw - means, weights))
+        )
     since_ns = int(time_ns[place])
     share = float(weights[place:].sum() / weights.sum())
     error = math.hypot(
@@ -311,13 +321,25 @@ def _change_within(
     return size, abs(size) / max(error, 1e-300), since_ns
 
 
-def _mixture_words(change: tuple[float, float, int], place: str) -> str:
-    size, _, since_ns = change
+def _slow_sd(time_ns: IntArray, rest: FloatArray, weights: FloatArray) -> float:
+    """Return the sd of half-day means about two fitted levels; of all members if there are few."""
+    _, half_day = np.unique(time_ns // _HALF_DAY_NS, return_inverse=True)
+    weight = np.bincount(half_day, weights)
+    mean = np.bincount(half_day, weights * rest) / weight
+    if len(mean) < _LEAST_HALF_DAYS:
+        return math.sqrt(float(np.average(rest**2, weights=weights)))
+    return math.sqrt(float(np.sum(mean**2)) / (len(mean) - 2))
+
+
+def _moved(size_mw: float, place: str) -> str:
+    return f'{short(abs(size_mw), 1)} MW {"more" if size_mw > 0.0 else "less"} {place}'
+
+
+def _mixture_words(since_ns: int, moved: str) -> str:
     return (
-        f'The unit changed within these data: since about {minute(since_ns)} it gives '
-        f'{short(abs(size), 1)} MW {"more" if size > 0.0 else "less"} at the same opening and '
-        f'pressure {place}, so this curve is a mixture of before and after. "valveflow diagnose" '
-        'looks for the cause; "valveflow '
+        f'The unit changed within these data: since about {minute(since_ns)} it gives {moved}, '
+        'at the same opening and pressure, so this curve is a mixture of before and after. '
+        '"valveflow diagnose" looks for the cause; "valveflow '
         f'identify --from {minute(since_ns).removesuffix(" UTC").replace(" ", "T")}Z" gives the '
         'curve since then.'
     )

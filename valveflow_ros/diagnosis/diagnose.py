@@ -669,7 +669,7 @@ def _conclude(
     if verdict == UNEXPLAINED:
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
     causes = () if dropped else causes
-    unexplained = _unexplained(rest)
+    unexplained, unexplained_mw = _unexplained(rest)
     simulation = models[0] if changed is None else changed.given
     extended = models[0] if dropped else models[-1]
     before, after = (rmse(found.task, m, grids.sealed_rows) for m in (simulation, extended))
@@ -678,7 +678,7 @@ def _conclude(
         verdict=verdict, sentence='', causes=earlier + causes + outside,
         not_told_apart=near, experiments=_experiments(earlier + causes),
         disturbance=rest.disturbance,
-        unexplained_by=unexplained, unexplained_mw=math.sqrt(rest.left_mw2),
+        unexplained_by=unexplained, unexplained_mw=unexplained_mw,
         rejected=tuple(found.reasons.items()),
         rmse_simulation=before, rmse_extended=after,
         rmse_noise_floor=noise_floor(found.task, models[-1], explained),
@@ -764,14 +764,21 @@ _IN_WORDS = {
 }  # fmt: skip
 
 
-def _unexplained(rest: _Rest) -> tuple[str, ...]:
+def _unexplained(rest: _Rest) -> tuple[tuple[str, ...], float]:
+    """Return what the rest depends on, and the root mean square of that without the time, MW."""
     course, structure = rest.course, rest.structure
-    names = structure.variables if structure.there else ()
+    names, variance = (
+        (structure.variables, structure.explained_mw2) if structure.there else ((), 0.0)
+    )
     if course is not None:
         # A large change in time also shows in variables that correlate with time by chance.
-        small = course.rms_mw**2 < structure.explained_mw2
-        names = (*names, _THE_TIME) if small else (_THE_TIME,)
-    return (*names, rest.period.words) if rest.period.there else names
+        if course.rms_mw**2 < structure.explained_mw2:
+            names = (*names, _THE_TIME)
+        else:
+            names, variance = (_THE_TIME,), 0.0
+    if rest.period.there:
+        names, variance = (*names, rest.period.words), variance + rest.period.variance_mw2
+    return names, math.sqrt(variance)
 
 
 def _experiments(causes: tuple[NamedCause, ...]) -> tuple[str, ...]:
@@ -809,7 +816,7 @@ def _sentence(d: Diagnosis) -> str:
     )
     if d.unexplained_by == (_THE_TIME,):
         return f'{first}{wander.strip()}{but}{besides}'
-    names = listed([_IN_WORDS.get(name, name) for name in d.unexplained_by])
+    names = listed([_IN_WORDS.get(n, n) for n in d.unexplained_by if n != _THE_TIME])
     return (
         f'{first}Measured and simulated power {"still " if first else ""}differ by '
         f'{d.rmse_extended:.2g} MW (root mean square). Of this about '

@@ -217,7 +217,7 @@ def _whitening_loss(effect: FloatArray, good: BoolArray, rows: int, ar: FloatArr
     for t in range(1, _RESPONSE):
         back = response[max(t - len(ar), 0) : t][::-1]
         response[t] = float(ar[: len(back)] @ back)
-    m = len(effect)
+    effect, m = effect - float(effect[good].mean()), len(effect)
     whole = np.convolve(np.repeat(effect, rows), response)[: m * rows]
     whole = whole.reshape(m, rows).mean(axis=1)
     small = float(np.var(effect[good]))

@@ -205,12 +205,16 @@ def gain_by_load(data: Identified) -> list[LoadGain]:
     return found
 
 
+def _load_head(data: Identified) -> str:
+    unit = data.characteristic.output_unit
+    return f'{"flow" if unit in FLOW_UNITS else "load"} ({unit})'
+
+
 def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of MW per % of opening by load."""
     unit, gains = data.characteristic.output_unit, gain_by_load(data)
     digits = 1 if all(g.pressure_high > _SMALL_MPA for g in gains) else 3
-    load = 'flow' if unit in FLOW_UNITS else 'load'
-    head = [f'{load} ({unit})', 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
+    head = [_load_head(data), 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
             f'{unit} per 1 % of opening', '95 % interval', 'over that range']  # fmt: skip
     cells = [
         [
@@ -248,7 +252,12 @@ def reference_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     Both curves are read at the same opening and pressure; there are no cells without a reference.
     """
     c, r, shift = data.characteristic, data.reference, data.shift
-    head = ['load (MW)', 'MW per 1 % of opening', 'in the reference', 'change of the power (MW)']
+    head = [
+        _load_head(data),
+        'MW per 1 % of opening',
+        'in the reference',
+        'change of the power (MW)',
+    ]
     if r is None or shift is None:
         return head, []
     at = np.array([(g.opening, g.pressure) for g in gain_by_load(data)]).reshape(-1, 2)

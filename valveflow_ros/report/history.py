@@ -462,7 +462,7 @@ def curve_history_figure(history: History) -> Figure:
     first, last = history.curves[0], history.curves[-1]
     layout: Spec = {
         'xaxis': plot.time_axis(anchor='y2'),
-        'yaxis': plot.axis('power against<br>the last (MW)', domain=[0.5, 1.0]),
+        'yaxis': plot.axis('power less<br>last curve (MW)', domain=[0.5, 1.0]),
         'yaxis2': plot.axis(
             f'breakpoints<br>u ({say.input_unit(last.exponent)})', domain=[0.0, 0.42]
         ),

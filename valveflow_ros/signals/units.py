@@ -99,7 +99,9 @@ _OUTPUT_WORDS = re.compile(
     r"""|(?P<made>[Gg]enerated )?(?<!/)(?P<power>[Pp]owers?))(?!\w|[.=:-]\w|"\s*:)"""
 )
 
-_LOADS = re.compile(r'\b((?:at|each|full|of|one|several|that|the|this) )load(s?)\b|^load(?= \()')
+_LOADS = re.compile(
+    r"(?<![\w='])((?:at|each|full|high|low|mean|of|one|other|several|that|the|this) )load(s?)\b"
+)
 
 
 def in_unit(text: str, unit: str) -> str:
@@ -119,7 +121,7 @@ def in_unit(text: str, unit: str) -> str:
         divides = found.start() > 0 and found.string[found.start() - 1] == '/'
         return f'({unit}){more}' if divides or more else unit
 
-    text = _LOADS.sub(lambda found: f'{found[1] or ""}flow{found[2] or ""}', text)
+    text = _LOADS.sub(r'\1flow\2', text)
     return _OUTPUT_WORDS.sub(told, text)
 
 

@@ -283,7 +283,7 @@ class StateStore:
         self.saved = None
         self.lost = not whole
         stays = self._folder is not None and self._folder.set_aside()
-        kept = f'It is kept as {ASIDE}' if stays else f'It is not kept: {ASIDE} holds a larger one'
+        kept = f'It is kept as {ASIDE}' if stays else f'It is not kept as {ASIDE}'
         then = (
             f'{kept}, and a run with the same settings will use it.' if whole and stays else
             f'{kept}. Its window, active alarms and reference are not used; its curves are in the '
