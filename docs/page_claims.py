@@ -44,7 +44,7 @@ _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
 _HIDDEN, _NULL = 'hidden_33000_33005', 'null_33000_33149'
-_SMALL = 'diagnosis_hidden_33100_33102_5d'
+_SMALL = 'diagnosis_hidden_30000_30002_5d'
 _NAMES = {
     'means over a minute': 'thermal_names_minute_3201_3217',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
@@ -181,7 +181,7 @@ def _diagnosis() -> list[Row]:
         if name.startswith('outside'):
             wrong = r['named_with_confidence_wrongly']
             text += f' said to be unexplained, {wrong} named with confidence'
-        if name == _HIDDEN:
+        if name.startswith(('hidden', 'pair', 'triple')):
             text += f' ({_bends(r)})'
         rows.append(_row(question, text, f'diagnosis_{name}_5d'))
     r = result(_SMALL)
@@ -206,12 +206,11 @@ def _diagnosis() -> list[Row]:
     ]  # fmt: skip
 
 
-def _bends(hidden: dict[str, Any]) -> str:
-    """Return how many bends of the curve are among the records, and how many were named."""
-    bends = hidden['table']['curve_shape']
+def _bends(study: dict[str, Any]) -> str:
+    """Return in how many of the records with a bend of the curve everything was named."""
+    bends = [row['right'] for row in study['rows'] if 'curve_shape' in row['label']]
     return (
-        f'{bends["right"]} of the {bends["records"]} bends of the curve among them, which need '
-        'an earlier model'
+        f'{sum(bends)} of the {len(bends)} with a bend of the curve, which needs an earlier model'
     )
 
 
