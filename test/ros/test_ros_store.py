@@ -149,7 +149,7 @@ def test_a_state_that_is_not_whole_is_told_until_the_next_start(tmp_path, how):
     with store(tmp_path) as found:
         assert found.saved is None
         assert found.sentence.startswith('The state saved by an earlier run is not used. ')
-        assert 'alarms and reference of before are gone' in found.sentence
+        assert 'active alarms and reference are not used' in found.sentence
         assert found.sentence.endswith('.')
         assert (found.item().level, found.item().sentence) == (Level.WARN, found.sentence)
     with store(tmp_path) as again:
