@@ -87,17 +87,13 @@ def test_a_valve_with_opening_and_flow_only_gets_a_command_that_works(run, tmp_p
     assert '540.0 degC' in ran.out
 
 
-def test_a_constant_pressure_is_proposed_only_where_a_flow_is_the_output(run, tmp_path):
+def test_beside_a_power_no_constant_pressure_is_proposed(run, tmp_path):
     path = tmp_path / 'unit.csv'
-    for head, row in (
-        ('Valve position (%),Fresh steam,Steam temp (degC),Gross power (MW),Feedwater (t/h)',
-         '60,130,538,250,800'),
-        ('FV101.OP (%),before (bar),behind (bar),Fluid temp (degC),FT101 (t/h)', '60,9,8,20,80'),
-    ):  # fmt: skip
-        rows = [f'2026-01-01T{k // 60:02}:{k % 60:02}:00,{row}' for k in range(N)]
-        path.write_text('\n'.join([f'time,{head}', *rows]) + '\n')
-        said = run('import', path, '--dry-run').refused()
-        assert 'main_steam_pressure=1' not in said.splitlines()[-1], head
+    head = 'time,Valve position (%),Fresh steam,Steam temp (degC),Gross power (MW),Feedwater (t/h)'
+    rows = [f'2026-01-01T{k // 60:02}:{k % 60:02}:00,60,130,538,250,800' for k in range(N)]
+    path.write_text('\n'.join([head, *rows]) + '\n')
+    last = run('import', path, '--dry-run').refused().splitlines()[-1]
+    assert '--column main_steam_pressure=THEIRS' in last
 
 
 def test_what_only_the_person_knows_is_left_to_be_filled_in(run, table, tmp_path):

@@ -275,12 +275,6 @@ class _Rest:
     start_ns: int = 0
 
     @property
-    def left_mw2(self) -> float:
-        """Return the variance that still depends on a variable or repeats with a period."""
-        structure = self.structure.explained_mw2 if self.structure.there else 0.0
-        return max(structure, self.period.variance_mw2 if self.period.there else 0.0)
-
-    @property
     def disturbance(self) -> Disturbance | None:
         """Return the slow disturbance of the power; None if there is none."""
         slow, course = self.drift, self.course
@@ -737,7 +731,8 @@ def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str,
 
     If the remaining structure exceeds what the causes explain, they are only approximate.
     """
-    left = rest.left_mw2
+    structure = rest.structure.explained_mw2 if rest.structure.there else 0.0
+    left = max(structure, rest.period.variance_mw2 if rest.period.there else 0.0)
     if left > 0.0:
         rows = found.task.rows
         own = float(

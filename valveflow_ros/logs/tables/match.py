@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 import zoneinfo
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -188,7 +188,7 @@ class Matcher:
                 f'{", ".join(told)}; the {self.what}s are: {self._have(chosen)}. Name '
                 f'yours with {options}{constant}{apart}'
             )
-        remedies += [self._naming(topic, chosen, remedies) for topic in topics if topic != TIME]
+        remedies += [self._naming(topic, chosen) for topic in topics if topic != TIME]
         remedies += [] if no_time is None else [no_time]
         return RefusedError(self.path, '; '.join(parts), remedies)
 
@@ -209,28 +209,18 @@ class Matcher:
             added.append(option(topic, THEIRS, 't/h'))
         return f'; for a control valve with opening and flow only, add {" ".join(added)}'
 
-    def _naming(
-        self, topic: str, chosen: Mapping[Signal, Chosen], remedies: Sequence[Remedy]
-    ) -> Remedy:
+    def _naming(self, topic: str, chosen: Mapping[Signal, Chosen]) -> Remedy:
         """Return the option for a signal that was not found.
 
         The temperature is often not recorded, and beside a flow as output neither is the pressure.
         """
         if topic == SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic:
             return Remedy('constant', f'{topic}={_USUAL_DEGC}')
-        steam, power = Signal.MAIN_STEAM_PRESSURE, Signal.GENERATED_POWER
-        if topic == SIGNALS[steam].topic and not any(
-            self._may_be(steam, k) for k in range(len(self.names))
-        ):
-            places = [chosen[power].place] if power in chosen else []
-            output = SIGNALS[power].topic
-            places += [
-                self.names.index(r.value.partition('=')[2])
-                for r in remedies
-                if r.value.partition('=')[0] == output and r.value.partition('=')[2] in self.names
-            ]
-            if any(words.flow_spelled(self._units[k]) for k in places):
-                return Remedy('constant', f'{topic}=1')
+        power = Signal.GENERATED_POWER
+        output = chosen[power].theirs if power in chosen else self._only_in_unit_of(power, chosen)
+        is_flow = output is not None and words.flow_spelled(self._units[self.names.index(output)])
+        if topic == SIGNALS[Signal.MAIN_STEAM_PRESSURE].topic and is_flow:
+            return Remedy('constant', f'{topic}=1')
         return choosing(topic, THEIRS)
 
     def missing(self, theirs: str, name: str) -> RefusedError:
