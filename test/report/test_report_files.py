@@ -134,11 +134,13 @@ def test_the_first_run_is_known_by_the_empty_cache(tmp_path, off, told):
 def test_what_is_compiled_beside_is_what_an_identification_uses(tmp_path):
     def run(code):
         subprocess.run([sys.executable, '-c', code], check=True, env=there)
-        return sorted(file.name for file in tmp_path.rglob('kernels.*.nbc'))
+        patterns = 'kernels.*.nbc', 'search.search_groups*.nbc'
+        return sorted(file.name for p in patterns for file in tmp_path.rglob(p))
 
     there = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
-    beside = run('from valveflow_ros.report.first_run import compile_fit; compile_fit()')
-    assert any(name.startswith('kernels.normal_sums') for name in beside)
+    beside = run('from valveflow_ros.report.first_run import compile_late; compile_late()')
+    for name in ('kernels.normal_sums', 'search.search_groups'):
+        assert any(file.startswith(name) for file in beside)
     whole = run('import valveflow_ros as vf; vf.identify(vf.simulate(0.4, 1).log)')
     assert whole == beside
 

@@ -263,6 +263,16 @@ def search_groups(
     return leaves
 
 
+def compile_search() -> None:
+    """Compile the search of a layer, which takes longest of all, by a search of no group."""
+    none = np.empty(0)
+    tree = Tree(0, 0, none, none, none, np.empty((0, 6, LEAF)), np.empty(0, np.int64),
+                np.empty((0, 7)))  # fmt: skip
+    table = np.empty((0, SLOTS, 5))
+    layer = Layer(2, 2, 0.0, 0.0, make_near(0), table, none, table)
+    search_groups(tree, layer, none, np.empty(0, np.int32), 0, 0)
+
+
 # Groups in one task of a thread. The number is fixed, so that the result does
 # not depend on the number of threads.
 _RUN = 64

@@ -35,24 +35,26 @@ def is_first_run() -> bool:
 
 
 def compile_beside() -> None:
-    """Start a process that compiles the joint fit while this one compiles what comes before it.
+    """Start a process that compiles what is needed last while this one compiles the rest.
 
     Numba compiles on one core only. The process ends with this one at the latest.
     """
     if cores() < 2 or not sys.executable:
         return
-    command = sys.executable, '-c', f'from {__name__} import compile_fit; compile_fit()'
+    command = sys.executable, '-c', f'from {__name__} import compile_late; compile_late()'
     nowhere = subprocess.DEVNULL
     with suppress(OSError):
         beside = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere)
         atexit.register(beside.kill)
 
 
-def compile_fit() -> None:
-    """Compile the loops of the joint fit into numba's cache, those that are needed last first."""
+def compile_late() -> None:
+    """Compile the search of the partition and the loops of the joint fit into numba's cache."""
     from valveflow_ros.curve.regional_model import RegionalModel
     from valveflow_ros.fit.problem import Problem, Samples
+    from valveflow_ros.partition.search import compile_search
 
+    compile_search()
     u, usable = np.linspace(1000.0, 2000.0, 64), np.ones(64, dtype=np.uint8)
     problem = Problem(Samples(u, 0.1 * u, usable, step_s=1.0, settle_s=0.0, group=2))
     model = RegionalModel(
