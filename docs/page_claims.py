@@ -251,9 +251,16 @@ def _loops() -> list[Row]:
                   for s in (ours, horch)]  # fmt: skip
         rows.append(
             _row('the same on valves of a refinery, known while the method was made',
-                 f"{counts[0]}, {ours['open']} not judged ({counts[1]} by Horch's test)",
+                 f"{counts[0]}, {ours['open']} not judged ({counts[1]} by Horch's test, which "
+                 'names a level valve by set-point steps alone)',
                  'refinery_valves')
         )  # fmt: skip
+    levels = told['simulated']['horch_on_levels']
+    rows.append(_row(
+        "Horch's test on simulated sound level loops whose set point changes; its author does not "
+        'apply it to them', f'sticking in {levels["named"]} of {levels["loops"]}',
+        'refinery_valves',
+    ))  # fmt: skip
     return rows
 
 
