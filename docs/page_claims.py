@@ -422,11 +422,12 @@ def installed() -> str:
         (
             row['python'], ', '.join(row['versions'][name] for name in names),
             f'{row["install_s"]:.0f} s', f'{row["size_mb"]} MB',
+            f'{row["size_without_pyc_mb"]} MB',
             f'{row["first_identify_s"]:.0f} s', f'{row["second_identify_s"]:.1f} s',
         )
         for row in kept['results']
     )  # fmt: skip
-    head = ('Python', 'NumPy, SciPy, pandas, Numba', 'installed in', 'size', 'first `identify`',
-            'second')  # fmt: skip
+    head = ('Python', 'NumPy, SciPy, pandas, Numba', 'installed in', 'size', 'without .pyc',
+            'first `identify`', 'second')  # fmt: skip
     where = f'{kept["cpus"]} processors with a load average of {kept["load_average"]}'
     return f'{table(head, rows)}\nMeasured on {where}.\n'

@@ -138,3 +138,20 @@ def test_a_change_within_three_of_its_errors_is_not_named(model):
     assert isinstance(told, str)
     assert 'cannot be distinguished' in told
     assert since(scaled_opening(1.02), model).name == 'input_change'
+
+
+@pytest.mark.parametrize(
+    ('change', 'names'),
+    [(unchanged, {'input_step'}), (scaled_power(0.97), {'gain_change', 'input_step'})],
+    ids=['within only', 'before and within'],
+)
+def test_a_change_within_the_record_is_told_from_one_before_it(model, change, names):
+    samples = table(DAYS, LATER, ('input_step:g=0.02,t0_days=1.2',), unit())
+    values = samples.values.copy()
+    change(values)
+    found = diagnose(record(replace(samples, values=values)), model, given=True)
+    assert {c.name for c in found.causes} == names, found.sentence
+    sizes = {c.name: c.parameters['g'] for c in found.causes}
+    assert sizes['input_step'].low <= 0.02 <= sizes['input_step'].high
+    if 'gain_change' in sizes:
+        assert sizes['gain_change'].low <= -0.03 <= sizes['gain_change'].high

@@ -329,6 +329,10 @@ def diagnose(
     rest = replace(_look_again(found), course=course, start_ns=found.task.grids.start_ns)
     rest = _withdraw(found, rest)
     _withdraw_small(found)  # what a withdrawn cause left to another one may be less
+    within = tuple(a for a in found.model.active if a.cause.slow)
+    if given and within:
+        # A change within the record is in its mean, and hides or imitates a change before it.
+        since = since_model(task, model, within)
     return _conclude(record, found, rest, wrong, since, progress)
 
 
@@ -664,7 +668,7 @@ def _conclude(
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
     causes = () if dropped else causes
     unexplained, unexplained_mw = _unexplained(rest)
-    simulation = models[0] if changed is None else changed.given
+    simulation = models[0] if changed is None else changed.given.without_causes()
     extended = models[0] if dropped else models[-1]
     before, after = (rmse(found.task, m, grids.sealed_rows) for m in (simulation, extended))
     explained = rest.structure.explained_mw2 if rest.structure.there else 0.0

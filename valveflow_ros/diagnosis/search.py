@@ -199,6 +199,10 @@ def search(
     """
     progress(0.05, 'simulation fitted to the record')
     task, plain, _ = settle(task, start, rounds=2, steps=4)
+    if task.fixed_dynamics:
+        # After a change of the curve its regions may be at the same u or at the same MW.
+        same_mw = replace(plain, base=plain.base.with_levels(start.base.levels))
+        plain = min((plain, same_mw), key=task.cost)
     found = SearchResult(task, plain, plain, rough=rough)
     barred: set[str] = set()
     every = causes_for(task.grids)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import Estimate
+from valveflow_ros.diagnosis.cause import Estimate, FittedCause
 from valveflow_ros.diagnosis.evidence import more_or_less, sealed_gain, where_largest
 from valveflow_ros.diagnosis.extended import Extended, answer, drive
 from valveflow_ros.diagnosis.fitting import Task, levels_along
@@ -108,7 +108,8 @@ class Change:
     name : str
         'gain_change', 'input_change', 'offset_change' or 'curve_change'.
     given, changed : Extended
-        The given model, without and with the change.
+        The given model, without and with the change, both with the known changes within the
+        record.
     parameters : dict
         By name, with 95 % intervals.
     sentence, meaning : str
@@ -132,7 +133,8 @@ class Change:
         plain : Extended
             With a newly fitted curve, which is used for a change of the curve.
         """
-        after = plain if self.name == CURVE else self.changed
+        same = replace(plain, active=self.given.active)
+        after = same if self.name == CURVE else self.changed
         gain = sealed_gain(task, self.given, after, len(_KINDS) + 1)
         experiment = _EXPERIMENT if self.near else ''
         return NamedCause(
@@ -141,7 +143,9 @@ class Change:
         )  # fmt: skip
 
 
-def since_model(task: Task, base: RegionalModel) -> Change | str:
+def since_model(
+    task: Task, base: RegionalModel, within: tuple[FittedCause, ...] = ()
+) -> Change | str:
     """Return the change since a model was found, or a sentence that none is known.
 
     Parameters
@@ -150,8 +154,10 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
         Only its open blocks are used.
     base : RegionalModel
         The given model; it is not refitted.
+    within : tuple of FittedCause
+        Known changes within the record: only what differs besides them is a change before it.
     """
-    given = Extended(base)
+    given = Extended(base, within)
     here = answer(task.grids, given)
     hats = _hats(here[task.rows])
     found = half_hours(
@@ -162,13 +168,13 @@ def since_model(task: Task, base: RegionalModel) -> Change | str:
             'The record is too short to tell whether the unit changed since the model was found.'
         )
     none, curve = regressions(found, [(), range(_HATS)])
-    fits = {name: _one(task, base, name) for name in _KINDS}
+    fits = {name: _one(task, given, name) for name in _KINDS}
     score = {name: fit.likelihood - PENALTY for name, (_, fit) in fits.items()}
     best = max(score, key=lambda name: score[name])
     by_hats = curve.likelihood - _HATS * PENALTY
     near = tuple(n for n in score if n != best and score[best] - score[n] < _TOLD)
     value, fit = fits[best]
-    changed = Extended(_levels_as_fit(task, base, _KINDS[best].act(base, value)))
+    changed = _levels_as_fit(task, given, _KINDS[best].act(base, value))
     moved = answer(task.grids, changed) - here
     alone = half_hours(task, given, task.rows, [moved]).free[:, 0]
     by_curve = found.free @ curve.coefficients
@@ -233,11 +239,11 @@ def _hats(here: FloatArray) -> FloatArray:
     return np.linspace(low, high, _HATS)
 
 
-def _one(task: Task, base: RegionalModel, name: str) -> tuple[float, Regression]:
+def _one(task: Task, given: Extended, name: str) -> tuple[float, Regression]:
     """Fit a change with one parameter; return its value and the last regression."""
     kind, value = _KINDS[name], 0.0
     for _ in range(_ROUNDS):
-        model = Extended(kind.act(base, value))
+        model = replace(given, base=kind.act(given.base, value))
         found = half_hours(task, model, task.rows, [_column(task, model, name, value)])
         (fit,) = regressions(found, [(0,)])
         value = float(np.clip(value + fit.coefficients[0], -kind.most, kind.most))
@@ -259,12 +265,10 @@ def _column(task: Task, model: Extended, name: str, value: float) -> FloatArray:
     return (up - down) / (2.0 * _SECANT * (1.0 + value))
 
 
-def _levels_as_fit(task: Task, base: RegionalModel, changed: RegionalModel) -> RegionalModel:
+def _levels_as_fit(task: Task, given: Extended, changed: RegionalModel) -> Extended:
     """Return the changed model with levels at the same MW or the same u as before."""
-    return min(
-        (changed, levels_along(base, changed, _scale(task))),
-        key=lambda model: task.cost(Extended(model)),
-    )
+    bases = (changed, levels_along(given.base, changed, _scale(task)))
+    return min((replace(given, base=base) for base in bases), key=task.cost)
 
 
 def _scale(task: Task) -> float:
