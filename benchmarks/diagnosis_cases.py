@@ -185,6 +185,9 @@ def _unit(rng: np.random.Generator) -> UnitDescription:
     return UnitDescription() if rng.random() < 1.0 / 3.0 else random_unit(rng)
 
 
+_AGAINST_A_MODEL = frozenset(('region_lag', 'curve_shape'))
+
+
 def hidden(names: tuple[str, ...], seed: int, days: float, times: tuple[float, float]) -> Case:
     """Return a plant with effects hidden in it."""
     label = '+'.join(names)
@@ -192,7 +195,9 @@ def hidden(names: tuple[str, ...], seed: int, days: float, times: tuple[float, f
     setting = Setting(rng, _unit(rng), days, *times)
     effects = tuple(drawn(name, setting) for name in names)
     kind = ('hidden', 'pair', 'triple')[len(names) - 1]
-    return Case(kind, label, seed, setting.unit, effects, given='region_lag' in names)
+    # The program judges neither without an earlier model.
+    given = not _AGAINST_A_MODEL.isdisjoint(names)
+    return Case(kind, label, seed, setting.unit, effects, given)
 
 
 CONFOUNDED = (

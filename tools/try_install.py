@@ -69,7 +69,7 @@ def version(python: str) -> tuple[int, int]:
 
 
 def megabytes(folder: Path) -> tuple[int, int]:
-    """Return the size of the files below a folder in units of 1e6 bytes, and without .pyc files."""
+    """Return the size of the files below a folder in 1e6 bytes, and without .pyc files."""
     sizes = [(p.lstat().st_size, p.suffix == '.pyc') for p in folder.rglob('*') if p.is_file()]
     whole, bare = sum(s for s, _ in sizes), sum(s for s, compiled in sizes if not compiled)
     return round(whole / 1e6), round(bare / 1e6)

@@ -198,11 +198,7 @@ def search(
     With ``earlier_curve`` the breakpoints of ``start`` were not found from this record.
     """
     progress(0.05, 'simulation fitted to the record')
-    task, plain, _ = settle(task, start, rounds=2, steps=4)
-    if task.fixed_dynamics:
-        # After a change of the curve its regions may be at the same u or at the same MW.
-        same_mw = replace(plain, base=plain.base.with_levels(start.base.levels))
-        plain = min((plain, same_mw), key=task.cost)
+    task, plain = _settled(task, start)
     found = SearchResult(task, plain, plain, rough=rough)
     barred: set[str] = set()
     every = causes_for(task.grids)
@@ -239,6 +235,16 @@ def search(
         if name not in found.model.names:
             found.reasons.setdefault(name, _BY_CHANCE)
     return found
+
+
+def _settled(task: Task, start: Extended) -> tuple[Task, Extended]:
+    """Return the plain model fitted to the record."""
+    task, plain, _ = settle(task, start, rounds=2, steps=4)
+    if task.fixed_dynamics:
+        # After a change of the curve its regions may be at the same u or at the same MW.
+        same_mw = replace(plain, base=plain.base.with_levels(start.base.levels))
+        plain = min((plain, same_mw), key=task.cost)
+    return task, plain
 
 
 def _conceal(found: SearchResult, barred: set[str]) -> None:
