@@ -171,7 +171,7 @@ def _at_loads(data: Identified) -> Iterator[tuple[float, FloatArray, FloatArray]
     low, high = np.quantile(power, (0.01, _LARGEST)).tolist() if len(power) else (0.0, 0.0)
     if not high > low:
         return
-    step = next((s for s in _LOADS if high - low > 4.0 * s), (high - low) / 4.0)
+    step = next((s for s in _LOADS if high - low > 8.0 * s), (high - low) / 8.0)
     for load in (np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step).tolist():
         near = np.abs(power - load) < _NEAR * (high - low)
         if near.sum() >= _LEAST_ROWS:
@@ -215,7 +215,7 @@ def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     unit, gains = data.characteristic.output_unit, gain_by_load(data)
     digits = 1 if all(g.pressure_high > _SMALL_MPA for g in gains) else 3
     head = [_load_head(data), 'median pressure (MPa)', 'usual range (MPa)', 'opening (%)',
-            f'{unit} per 1 % of opening', '95 % interval', 'over that range']  # fmt: skip
+            f'{unit} per 1 % of opening', '95 % interval', 'over the usual range']  # fmt: skip
     cells = [
         [
             say.decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1),
@@ -240,8 +240,7 @@ def gain_table(data: Identified) -> str:
     if not data.one_pressure:
         caption += (
             ' The opening is the one that gives the load at the median pressure. The usual range '
-            'of the pressure holds for nine tenths of the time at this load; it is wide if the '
-            'unit at times keeps a higher pressure.'
+            'of the pressure holds for nine tenths of the time at this load.'
         )
     return html.table(head, cells, caption=caption) if cells else ''
 
@@ -255,7 +254,7 @@ def reference_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
     head = [
         _load_head(data),
         'MW per 1 % of opening',
-        'in the reference',
+        'in the reference, at the same opening',
         'change of the power (MW)',
     ]
     if r is None or shift is None:
@@ -296,7 +295,7 @@ def answer_words(data: Identified) -> str:
     c = data.shown
     words = (
         f'The flow characteristic has <b>{say.counted(len(c.pieces), "piece")}</b>. '
-        f'{range_words(data)}{_bends(c)} It explains '
+        f'{range_words(data)}{_bends(data)} It explains '
         f'{say.percent(explained(data))} of the variance of the power in '
         f'{say.counted(c.source.steady, "steady-state segment")} and '
         f'{say.counted(c.source.slope_response, "slope-response segment")} '
@@ -345,18 +344,25 @@ def range_words(data: Identified) -> str:
     return f'{known} ({over_u}).' if over_u else f'{known}.'
 
 
-def _bends(c: Characteristic) -> str:
+def _bends(data: Identified) -> str:
+    """Return where one per cent of opening gives least and most, and where the curve is flat."""
+    c, unit = data.shown, data.characteristic.output_unit
     if len(c.pieces) == 1:
         return ' It is straight.'
-    steep = max(c.pieces, key=lambda p: p.slope)
-    flat = min(c.pieces, key=lambda p: p.slope)
-    said = f' The power rises most steeply at {c.place_words(steep.u_from, steep.u_to)}'
+    gains, said = sorted(gain_by_load(data), key=lambda g: g.gain), ''
+    if len(gains) > 1:
+        least, most = (
+            f'{say.plain(g.gain, 2)} {unit} at {say.decimals(g.load, 0)} {unit}'
+            for g in (gains[0], gains[-1])
+        )
+        said = f' One per cent of opening gives from {least} to {most}.'
+    flat, *_, steep = sorted(c.pieces, key=lambda p: p.slope)
     there = c.place_words(flat.u_from, flat.u_to)
     if flat.slope <= 0.0:
-        return f'{said}; at {there} opening further <b>does not raise the power</b>.'
-    weak = ': there the valve hardly changes the power' if flat.slope < _FLAT * steep.slope else ''
-    times = say.plain(steep.slope / flat.slope, 2)
-    return f'{said}, and {times} times less at {there}{weak}.'
+        return f'{said} At {there} opening further <b>does not raise the power</b>.'
+    if flat.slope < _FLAT * steep.slope:
+        said += f' At {there} the valve hardly changes the power.'
+    return said
 
 
 def pieces_table(data: Identified) -> str:
@@ -413,18 +419,19 @@ def breakpoints_table(c: Characteristic) -> str:
     return html.table(['break&shy;point', f'{u} ({unit})', '95 % interval', 'power (MW)'], rows)
 
 
-def temperature_words(c: Characteristic) -> str:
+def temperature_words(data: Identified) -> str:
     """Return the temperature during the special segments in words."""
-    source = c.source
+    source = data.characteristic.source
     if not math.isfinite(source.temperature_spread_k):
         return 'The main steam temperature is not known.'
     mean = f'{say.decimals(source.temperature_mean_degc, 1)} °C'
     if source.temperature_spread_k == 0.0:
         return f'Main steam temperature: {mean} throughout.'
-    verdict = 'more than the method allows for' if source.temperature_flag else 'within its limit'
+    limit = say.plain(data.settings.real('temperature_spread_limit'))
     return (
         f'Main steam temperature in the special segments: mean {mean}, 95 % of it within '
-        f'{say.plain(source.temperature_spread_k, 3)} K, {verdict}.'
+        f'{say.plain(source.temperature_spread_k, 3)} K, '
+        f'{"more than" if source.temperature_flag else "within"} the limit of {limit} K.'
     )
 
 

@@ -121,7 +121,7 @@ def opening_figure(data: Identified) -> Figure | None:
     ]  # fmt: skip
     caption = (
         '<b>Power against opening.</b> The same curve against the opening of '
-        f'the valve, at the median pressure of the record, {middle:.3g} MPa'
+        f'the valve, at the median pressure of the special segments, {middle:.3g} MPa'
         + (', and at its 5 % and 95 % quantiles.' if wide else '.')
         + ' Each line ends with the openings seen at its pressure, within 2 %.'
     )
@@ -231,9 +231,8 @@ def _caption(data: Identified) -> str:
         )
     if _unrefined(data):
         parts.append(
-            'The dashed <span class="key raw">line</span> is the exact partition before the '
-            'dynamics were fitted too; it differs from the curve where the lag on ramps had '
-            'shifted it.'
+            'The dashed <span class="key raw">line</span> is the curve before it was corrected '
+            'for the delay and lag of the unit on ramps.'
         )
     return ' '.join(parts)
 

@@ -16,7 +16,7 @@ import numpy as np
 from valveflow_ros.numerics import cores
 
 SENTENCE = (
-    'The program is now compiled for this machine, once. This takes half a minute to a minute.'
+    'The program is now compiled for this machine, once. This takes about half a minute.'
 )
 _FOLDERS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
 _ENGINE = tuple(f'valveflow_ros.{name}' for name in _FOLDERS)

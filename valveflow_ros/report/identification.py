@@ -107,7 +107,7 @@ def _dynamics(c: Characteristic) -> Section:
 
 def _read(data: Identified) -> Iterator[str]:
     c = data.characteristic
-    yield html.paragraph(html.text(temperature_words(c)))
+    yield html.paragraph(html.text(temperature_words(data)))
     yield html.paragraph(
         f'Noise used for the thresholds, as standard deviation of block means: '
         f'{say.plain(data.shown.residuals.input_noise, 3)} in '

@@ -252,10 +252,14 @@ def _text(made: Compensation, pressures: Sequence[float], tolerance: float, path
 
     x, u = made.power_mw, made.u
     low, high = made.useful_mw
+    m = made.curve.pressure_exponent
     return lines(
         f'Wrote {counted(len(x), "point")} to {path}: {decimals(float(x[0]), 2)} to '
         f'{decimals(float(x[-1]), 2)} MW, u from {decimals(float(u[0]), 2)} to '
         f'{decimals(float(u[-1]), 2)}.',
+        f'The opening in % is u / p^{m:.4g}, with the main steam pressure p in MPa, absolute.'
+        if m
+        else 'Here u is the opening in %.',
         _pieces(made, pressures),
         f'Largest gain {plain(float(made.gains.max()), 3)} units of u per MW, least '
         f'{plain(float(made.gains.min()), 3)}; from one piece to the next it changes by up '

@@ -117,7 +117,7 @@ def _text(found: Identified) -> str:
         f'{counted(c.source.slope_response, "slope-response segment")}, '
         f'{counted(c.source.samples, "sample")}. Typical difference '
         f'{plain(c.residuals.rmse_mw, 2)} MW.',
-        answer.temperature_words(c),
+        answer.temperature_words(found),
         held_words(c.held),
         *c.notes,
         '' if found.shift is None else f'Against the reference: {found.shift.sentence}',

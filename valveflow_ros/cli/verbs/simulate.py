@@ -161,7 +161,8 @@ def _paper_lines(log: SimulatedLog) -> list[str]:
     for k, region in enumerate(log.unit.regions):
         to = f'up to {plain(region.power_to_mw)} MW' if region.power_to_mw < 1e9 else 'above'
         head = '  dynamics' if k == 0 else '          '
-        lines.append(f'{head} T {region.time_constant_s:g} s, tau {region.delay_s:g} s {to}')
+        times = f'time constant {region.time_constant_s:g} s, delay {region.delay_s:g} s'
+        lines.append(f'{head} {times} {to}')
     return lines
 
 

@@ -142,24 +142,34 @@ class Matcher:
         self, missing: list[str], several: list[str], remedies: list[Remedy],
         chosen: Mapping[Signal, Chosen],
     ) -> None:  # fmt: skip
-        """Propose a column for a missing signal if it is the only one left in a suitable unit."""
+        """Propose a column for a missing signal if it is the only one left in a suitable unit.
+
+        A last column without a unit is proposed as the temperature, if only that is missing.
+        """
+        cold = SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic
         for info in SIGNALS:
             only = self._only_in_unit_of(info.signal, chosen) if info.topic in missing else None
+            why, otherwise = 'in a unit of it', ''
+            if only is None and missing == [cold] and info.topic == cold:
+                left = self._unused(chosen)
+                only = self.names[left[0]] if len(left) == 1 and not self._units[left[0]] else None
+                why, otherwise = 'left', f', else --constant {cold}={_USUAL_DEGC}'
             if only is not None:
                 missing.remove(info.topic)
                 several.append(
-                    f"no {self.what} was recognised as {info.topic}, but '{only}' alone is in a "
-                    f'unit of it: if that is it, add {option(info.topic, only)}'
+                    f"no {self.what} was recognised as {info.topic}, but '{only}' alone is {why}: "
+                    f'if that is it, add {option(info.topic, only)}{otherwise}'
                 )
                 remedies.append(choosing(info.topic, only))
 
+    def _unused(self, chosen: Mapping[Signal, Chosen]) -> list[int]:
+        """Return the places of the columns with a name that are no time and no signal yet."""
+        taken = {*self._taken, *(c.place for c in chosen.values())}
+        return [k for k, name in enumerate(self.names) if k not in taken and name]
+
     def _only_in_unit_of(self, signal: Signal, chosen: Mapping[Signal, Chosen]) -> str | None:
         """Return the only unused column with a unit of the signal; None if not exactly one."""
-        taken = {*self._taken, *(c.place for c in chosen.values())}
-        found = [
-            name for k, name in enumerate(self.names)
-            if k not in taken and name and self._may_be(signal, k)
-        ]  # fmt: skip
+        found = [self.names[k] for k in self._unused(chosen) if self._may_be(signal, k)]
         return found[0] if len(found) == 1 else None
 
     def _may_be(self, signal: Signal, place: int) -> bool:

@@ -55,7 +55,7 @@ def gain_step(values: Values, hooks: Hooks) -> None:
 
 
 @effect(
-    'The flow area belonging to a reading of u rises or falls steadily.',
+    'The pressure or position transmitter drifts: the same reading passes more and more steam.',
     Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),
 )
 def input_drift(values: Values, hooks: Hooks) -> None:
@@ -70,7 +70,7 @@ def input_drift(values: Values, hooks: Hooks) -> None:
 
 
 @effect(
-    'The flow area belonging to a reading of u changes at one moment.',
+    'The pressure or position transmitter is recalibrated: the same reading passes more steam.',
     Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2),
     ONSET,
 )
