@@ -390,8 +390,8 @@ def shift_section(data: Identified) -> Section | None:
     told = html.text(shift.sentence)
     name, scale = say.input_name(data.shown.pressure_exponent), data.u_per_percent
     head = [
-        'piece', name, 'moved', 'now (MW)', '% of flow', 'curves differ in the middle by (MW)',
-        'along the piece (MW)', 'confidence', 'smallest shift seen (MW)',
+        'piece', name, 'moved', 'now (MW)', '% of flow', 'difference in the middle (MW)',
+        'along the piece (MW)', 'confidence that it moved', 'smallest visible move (MW)',
     ]  # fmt: skip
     parts: list[str | Figure] = [
         html.notice(told) if shift.moved else html.paragraph(told),

@@ -42,7 +42,7 @@ with column names that the program cannot recognise:
       --constant main_steam_temperature=540 --time-zone Europe/Berlin"""
 
 _OPCUA = 'opcua://'
-_HEAD = ('your column', 'is', 'why', 'in', 'runs from')
+_HEAD = ('your column', 'is', 'found', 'converted', 'values')
 _FLAGS = ('dry_run', 'overwrite', 'quiet', 'json')
 # Columns named in a sentence.
 _NAMED = 3
