@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +25,7 @@ from benchmarks import diagnosis_cases as plants
 from benchmarks import study
 from benchmarks.diagnosis_cases import Case
 from benchmarks.diagnosis_outside import OUTSIDE, SLOW, added_to, slowly
+from valveflow_ros.diagnosis.causes.since_model import CURVE
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.result import Diagnosis
 from valveflow_ros.errors import ValveflowError
@@ -75,14 +77,20 @@ def covered(case: Case, found: Diagnosis) -> dict[str, list[Any]]:
     }  # fmt: skip
 
 
+def told_of(true: Collection[str], names: Iterable[str]) -> set[str]:
+    """Return the names, a change of the curve as the bump that it is."""
+    bump = 'curve_shape'
+    return {bump if name == CURVE and bump in true else name for name in names}
+
+
 def right(case: Case, found: Diagnosis) -> bool:
     """Tell whether all causes and no others are named, or what has no name is said to be there.
 
-    A bump that is called a dent is wrong; either of both is not. A slow change is to be told as
-    one in time, and no cause named in its place; an offset that switches is what the cause
-    ``intervals`` is for.
+    A bump that is called a dent is wrong; either of both is not. Beside an earlier model a bump is
+    also a change of the curve since then. A slow change is to be told as one in time, and no cause
+    named in its place; an offset that switches is what the cause ``intervals`` is for.
     """
-    names = {c.name for c in found.causes}
+    names = told_of(case.names, [c.name for c in found.causes])
     if case.kind == 'slow':
         if case.label == 'switching offset' and names:
             return names == {'intervals'}
@@ -151,7 +159,7 @@ def confidently_wrong(row: dict[str, Any]) -> bool:
     true = set() if none else set(row['label'].split(',')[0].split('+'))
     if row['label'] == 'switching offset':
         true = {'intervals'}
-    return bool(set(row['names']) - true) and not true & set(row['not_told_apart'])
+    return bool(told_of(true, row['names']) - true) and not true & set(row['not_told_apart'])
 
 
 def counts(rows: list[dict[str, Any]]) -> dict[str, Any]:

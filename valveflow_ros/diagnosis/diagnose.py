@@ -332,10 +332,9 @@ def diagnose(
     rest = replace(_look_again(found), course=course, start_ns=found.task.grids.start_ns)
     rest = _withdraw(found, rest)
     _withdraw_small(found)  # what a withdrawn cause left to another one may be less
-    within = tuple(a for a in found.model.active if a.cause.slow)
-    if given and within:
-        # A change within the record is in its mean, and hides or imitates a change before it.
-        since = since_model(task, model, within)
+    if given and found.model.active:
+        # Their mean effect on the record hides or imitates a change before it.
+        since = since_model(task, model, found.model.active)
     return _conclude(record, found, rest, wrong, since, progress)
 
 

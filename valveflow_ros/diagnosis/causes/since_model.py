@@ -108,8 +108,7 @@ class Change:
     name : str
         'gain_change', 'input_change', 'offset_change' or 'curve_change'.
     given, changed : Extended
-        The given model, without and with the change, both with the known changes within the
-        record.
+        The given model, without and with the change, both with the causes found.
     parameters : dict
         By name, with 95 % intervals.
     sentence, meaning : str
@@ -144,7 +143,7 @@ class Change:
 
 
 def since_model(
-    task: Task, base: RegionalModel, within: tuple[FittedCause, ...] = ()
+    task: Task, base: RegionalModel, named: tuple[FittedCause, ...] = ()
 ) -> Change | str:
     """Return the change since a model was found, or a sentence that none is known.
 
@@ -154,10 +153,10 @@ def since_model(
         Only its open blocks are used.
     base : RegionalModel
         The given model; it is not refitted.
-    within : tuple of FittedCause
-        Known changes within the record: only what differs besides them is a change before it.
+    named : tuple of FittedCause
+        Causes found in the record: only what differs besides them is a change before it.
     """
-    given = Extended(base, within)
+    given = Extended(base, named)
     here = answer(task.grids, given)
     hats = _hats(here[task.rows])
     found = half_hours(
