@@ -210,6 +210,9 @@ _FULL_LOAD = 0.9  # quantile of the power
 # Part of a slow disturbance that a temperature may contain, as 95 % limit: fixed on units with
 # numbers 1401 to 1406.
 _AGREES = 0.1
+# The same of the error of the form, which healthy plants have, for units built from physics in
+# means over a minute: fixed on the units 4101 to 4112.
+_AGREES_OWN = 0.3
 _ACTS = 0.05  # fraction of the largest change below which there is no effect
 
 
@@ -647,9 +650,8 @@ def _conclude(
     task, final = _final(found)
     progress(0.9, 'how sure it is')
     estimates = Certainty(task, final).intervals() if final.active else {}
-    if 'temperature' in estimates and rest.drift.there:
-        share = rest.drift.rms_mw / math.sqrt(max(_explained(found, 'temperature'), 1e-12))
-        estimates['temperature'] = _beside_drift(estimates['temperature'], share)
+    if 'temperature' in estimates:
+        estimates['temperature'] = _with_what_agrees(found, rest, estimates['temperature'])
     place = final.place_words(grids.form)
     sentences = {
         a.name: a.sentence(grids.start_ns, estimates[a.name], place) for a in final.active
@@ -710,20 +712,18 @@ def _of_covariates(model: Extended) -> list[str]:
     return told
 
 
-def _beside_drift(k: dict[str, Estimate], share: float) -> dict[str, Estimate]:
-    """Return the size of a temperature effect with the error that a slow disturbance adds.
+def _with_what_agrees(
+    found: SearchResult, rest: _Rest, k: dict[str, Estimate]
+) -> dict[str, Estimate]:
+    """Return the size of a temperature effect with the error by what agrees with it a little.
 
-    Parameters
-    ----------
-    share : float
-        Root mean square of the disturbance over that of the effect.
-
-    Notes
-    -----
     A condenser that is not in the log follows the load with a lag, as the temperature of the
-    steam does: the two agree a little, and the size contains this part of the disturbance.
+    steam does: the size contains this part of the slow disturbance. The same holds for the error
+    of the form of the model, or of the recording.
     """
-    error = _AGREES * share
+    slow = _AGREES * rest.drift.rms_mw if rest.drift.there else 0.0
+    own = _AGREES_OWN * _LEAST_EXPLAINED * _range(found.task) if _own_size(found.task) else 0.0
+    error = math.hypot(slow, own) / math.sqrt(max(_explained(found, 'temperature'), 1e-12))
     return {
         name: replace(
             e,

@@ -205,8 +205,14 @@ def _long_means(result: Refined) -> tuple[str, ...]:
 
 
 def _time_error(time_s: float, error_s: float, step_s: float) -> float:
-    """Return the standard error of a time; rows far apart hide shorter times than their step."""
-    return max(error_s, step_s) if time_s < step_s >= COARSE_STEP_S else error_s
+    """Return the standard error of a time constant or a delay.
+
+    Rows far apart hide shorter times than their step, and of a longer one they do not tell which
+    part of a step is lag and which is delay: an even distribution over one step.
+    """
+    if step_s < COARSE_STEP_S:
+        return error_s
+    return max(error_s, step_s) if time_s < step_s else math.hypot(error_s, step_s / 12.0**0.5)
 
 
 def _flow_at_ends(m: RegionalModel, samples: Samples) -> FloatArray:

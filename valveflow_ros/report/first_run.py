@@ -15,9 +15,7 @@ import numpy as np
 
 from valveflow_ros.numerics import cores
 
-SENTENCE = (
-    'The program is now compiled for this machine, once. This takes about half a minute.'
-)
+SENTENCE = 'The program is now compiled for this machine, once. This takes about half a minute.'
 _FOLDERS = ('numerics', 'signals', 'segments', 'partition', 'curve', 'fit', 'monitoring')
 _ENGINE = tuple(f'valveflow_ros.{name}' for name in _FOLDERS)
 # Some functions are compiled only as part of others, or for tests.
