@@ -17,9 +17,12 @@ import valveflow_ros as vf
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.result import wrong_form
 from valveflow_ros.interface.models import load_model
+from valveflow_ros.interface.simulate import Simulation
 from valveflow_ros.plant.historian import Historian
+from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.thermal_plant import simulate_thermal
 from valveflow_ros.plant.thermal_unit import ThermalUnit, random_unit
+from valveflow_ros.plant.unit import random_unit as paper_unit
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.answer import LoadGain, gain_by_load
 from valveflow_ros.report.validation import verdict_words
@@ -57,6 +60,17 @@ def test_the_curve_is_right_over_opening_and_pressure_and_far_off_in_the_other_f
     assert 'is the wrong one' in held.page().to_html()
     assert 'is the wrong one' not in found.page().to_html()
     assert not any('mixture of before and after' in note for note in found.notes)
+
+
+def test_means_of_a_lively_unit_are_not_taken_for_noise_of_a_valve_that_stands_still():
+    unit = paper_unit(np.random.default_rng(5101))
+    log = Simulation(simulate(3.0, 5101, unit), 3.0, 5101)
+    frame = log.to_dataframe().set_index('time').resample('60s').mean().reset_index()
+    curve = vf.identify(frame, parameters={'pressure_exponent': 1.125}).characteristic
+    opening, pressure = frame['valve_opening_percent'], frame['main_steam_pressure_mpa']
+    assert np.ptp(opening.quantile([0.01, 0.99])) > 20.0
+    missed = curve.power(opening, pressure) - unit.curve((opening * pressure**1.125).to_numpy())
+    assert np.sqrt(np.nanmean(missed**2)) < 1.5
 
 
 def test_the_table_by_load_has_the_sliding_pressure_and_the_opening_that_gives_the_load():
