@@ -25,6 +25,7 @@ from benchmarks import diagnosis_cases as plants
 from benchmarks import study
 from benchmarks.diagnosis_cases import Case
 from benchmarks.diagnosis_outside import OUTSIDE, SLOW, added_to, slowly
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.causes.since_model import CURVE
 from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.result import Diagnosis
@@ -47,8 +48,8 @@ def simulated(case: Case, days: float) -> SimulatedLog:
     return log
 
 
-def diagnosed(case: Case, days: float) -> Diagnosis:
-    """Diagnose one plant with the model of its own record, or of an earlier one."""
+def record_of(case: Case, days: float) -> tuple[Record, RegionalModel]:
+    """Return the record of one plant, and the model of this record or of an earlier one."""
     log = simulated(case, days)
     settings = study.whole_window(case.unit, days)
     task, segments = study.task_of(log.table, settings)
@@ -60,8 +61,7 @@ def diagnosed(case: Case, days: float) -> Diagnosis:
     else:
         model, _ = outline(replace(task, form=StaticForm()))
     period_s = settings.real('sample_period')
-    record = Record(log.table, period_s, StaticForm(), settings.settle_s, spans)
-    return diagnose(record, model, case.given)
+    return Record(log.table, period_s, StaticForm(), settings.settle_s, spans), model
 
 
 def covered(case: Case, found: Diagnosis) -> dict[str, list[Any]]:
@@ -113,7 +113,7 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
     }  # fmt: skip
     begin = time.process_time()
     try:
-        found = diagnosed(case, days)
+        found = diagnose(*record_of(case, days), case.given)
     except ValveflowError as error:
         return {**about, 'verdict': 'refused', 'names': [], 'right': False, 'error': str(error),
                 'not_told_apart': [], 'parameters': {}}  # fmt: skip

@@ -43,8 +43,8 @@ _COVERAGE = 'coverage_9500_9699'
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_33000_33005', 'null_33000_33149'
-_SMALL = 'diagnosis_hidden_30000_30002_5d'
+_HIDDEN, _NULL = 'hidden_34000_34005', 'null_34000_34149'
+_SMALL = 'diagnosis_hidden_34100_34102_5d'
 _NAMES = {
     'means over a minute': 'thermal_names_minute_3201_3217',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
@@ -172,8 +172,8 @@ def _diagnosis() -> list[Row]:
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
          'may be named): told as a change in time, and nothing named'),
         ('confounded_33000_33003', 'two causes that look alike'),
-        ('pair_33000_33003', 'two causes at once: both named'),
-        ('triple_33000_33003', 'three causes at once: all named'),
+        ('pair_34000_34003', 'two causes at once: both named'),
+        ('triple_34000_34003', 'three causes at once: all named'),
         ('outside_33000_33002', 'effects outside the catalogue: none named'),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
@@ -209,9 +209,7 @@ def _diagnosis() -> list[Row]:
 def _bends(study: dict[str, Any]) -> str:
     """Return in how many of the records with a bend of the curve everything was named."""
     bends = [row['right'] for row in study['rows'] if 'curve_shape' in row['label']]
-    return (
-        f'{sum(bends)} of the {len(bends)} with a bend of the curve, which needs an earlier model'
-    )
+    return f'{sum(bends)} of the {len(bends)} with a bend of the curve, given an earlier model'
 
 
 def _since_model() -> Row:
