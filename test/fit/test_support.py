@@ -157,3 +157,13 @@ def test_a_slope_with_a_small_error_is_not_told_as_uncertain(stderr, words):
     (said,) = (note for note in told if note.startswith('Piece 1 '))
     assert 'has steady data at one load only' in said
     assert words in said
+
+
+def test_a_single_piece_rests_on_no_pieces_beside_it():
+    whole = curve([1000.0, 1400.0], [0.2])
+    pieces = tuple(dataclasses.replace(p, slope_stderr=0.002) for p in whole.pieces)
+    window = contents((1200.0, 1200.0, STEADY))
+    (*_, said) = with_support(dataclasses.replace(whole, pieces=pieces), window, NOISE).notes
+    assert said.startswith('Piece 1 ')
+    assert 'steady data at one load only: its slope follows from the samples in which' in said
+    assert 'beside' not in said

@@ -412,7 +412,7 @@ def _sentence(
     load = ' and one at '.join(loads)
     if borrowed:
         return (
-            f'{name}: its slope follows from the pieces beside it, and its error holds if the '
+            f'{name}: its slope follows from {lends(c)}, and its error holds if the '
             f'piece is straight. One hour of constant operation at about {load} would check it.'
         )
     return (
@@ -424,9 +424,17 @@ def _sentence(
 def is_borrowed(piece: Piece) -> bool:
     """Return True if the error of a slope is small although the piece has too few data.
 
-    The pieces meet, so that the data of its neighbours determine a piece too.
+    The pieces meet, so that the data of its neighbours determine a piece too; a single piece
+    is determined by the rows between its special segments.
     """
     return 0.0 < _Z95 * piece.slope_stderr < _SMALL * abs(piece.slope)
+
+
+def lends(c: Characteristic) -> str:
+    """Return what the slope of a piece follows from if `is_borrowed`, as a phrase."""
+    if len(c.pieces) == 1:
+        return 'the samples in which the valve moved'
+    return 'the pieces beside it'
 
 
 def _operation(c: Characteristic, piece: Piece, u: float, short_of: bool) -> str:

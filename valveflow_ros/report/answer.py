@@ -12,7 +12,7 @@ import numpy as np
 
 from valveflow_ros.curve.characteristic import Characteristic, Choice, RegionDynamics, piece_of
 from valveflow_ros.fit.model_form import Misfit
-from valveflow_ros.fit.result import forms_apart, is_borrowed, wrong_form
+from valveflow_ros.fit.result import forms_apart, is_borrowed, lends, wrong_form
 from valveflow_ros.fit.static_test import STATIC_RULE
 from valveflow_ros.fit.step_test import RULE
 from valveflow_ros.records import FLOW_UNITS, FloatArray, Signal
@@ -398,7 +398,7 @@ def _rests(c: Characteristic, k: int) -> list[str]:
     if found.identifiable:
         return [said]
     return [
-        f'{said}; the slope follows from the pieces beside it'
+        f'{said}; the slope follows from {lends(c)}'
         if is_borrowed(c.pieces[k])
         else f'<b>slope uncertain</b>: {said}'
     ]
