@@ -28,6 +28,7 @@ from valveflow_ros.report.history import (
     history_sections,
     largest_evidence,
 )
+from valveflow_ros.report.words import moment
 
 # The states that have a bar, as the picture names them; in the first two the condition stands.
 BARS = {
@@ -104,7 +105,7 @@ def test_a_step_shows_at_its_hour_and_only_where_it_was():
     assert knees['error_y']['array'] == [10.0] * 4
 
 
-def test_what_has_no_time_is_no_part_of_the_story_and_a_shift_has_its_last_words():
+def test_what_has_no_time_is_no_part_of_the_story_and_a_repetition_has_its_own_time():
     normal, stands = AlarmState.NORMAL, AlarmState.UNACKNOWLEDGED
     told = [
         AlarmMoment(0, 'curve_shift', normal, 'It has not come.', again=True),
@@ -112,12 +113,16 @@ def test_what_has_no_time_is_no_part_of_the_story_and_a_shift_has_its_last_words
         AlarmMoment(START_NS + 1, 'residual', stands, '9 MW less.'),
         AlarmMoment(START_NS + HOUR_NS, 'curve_shift', stands, '8 MW less.', again=True),
         AlarmMoment(START_NS + HOUR_NS, 'residual', stands, 'Not known.', again=True),
+        AlarmMoment(START_NS + 2 * HOUR_NS, 'curve_shift', stands, '8 MW less.', again=True),
     ]
     story = history_of(told, (), ())
     assert story.start_ns == START_NS
     assert [(a.time_ns, a.sentence) for a in story.alarms] == [
-        (START_NS, '8 MW less.'), (START_NS + 1, '9 MW less.'),
+        (START_NS, '3 MW less.'), (START_NS + 1, '9 MW less.'),
     ]  # fmt: skip
+    later = f'3 MW less. Repeated at {moment(START_NS + HOUR_NS)}: 8 MW less.'
+    assert [a.words for a in story.alarms] == [later, '9 MW less.']
+    assert later in words_of(story)
 
 
 @settings(max_examples=25)

@@ -45,6 +45,15 @@ class AlarmMoment:
     state: AlarmState
     sentence: str
     again: bool = field(default=False, compare=False)  # the alarm was in this state before
+    later_ns: int = 0  # of the last repetition with another sentence; 0 if there is none
+    later: str = ''  # its sentence
+
+    @property
+    def words(self) -> str:
+        """Return the sentence, and that of the last repetition with its time."""
+        if not self.later:
+            return self.sentence
+        return f'{self.sentence} Repeated at {say.moment(self.later_ns)}: {self.later}'
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,11 +137,11 @@ def history_of(
 
 
 def alarms_of(told: Iterable[AlarmMoment]) -> tuple[AlarmMoment, ...]:
-    """Return the changes in a series of alarm messages, in order, with their last sentences.
+    """Return the changes in a series of alarm messages, in order, each with its sentence.
 
     The daily repetition of a standing alarm is not a change, but its sentence on the size of a
-    shift is more accurate and replaces the earlier one. The first message of a standing alarm
-    counts: it stood at the start of the recording.
+    shift is more accurate and is kept beside the first one, with its time. The first message of
+    a standing alarm counts: it stood at the start of the recording.
     """
     changes: list[AlarmMoment] = []
     last: dict[str, int | None] = {}  # index of the last change of each alarm
@@ -142,7 +151,8 @@ def alarms_of(told: Iterable[AlarmMoment]) -> tuple[AlarmMoment, ...]:
             last[a.name] = len(changes)
             changes.append(a)
         elif a.name == _SHIFT and place is not None and changes[place].state == a.state:
-            changes[place] = replace(changes[place], sentence=a.sentence)
+            if a.sentence != (changes[place].later or changes[place].sentence):
+                changes[place] = replace(changes[place], later_ns=a.time_ns, later=a.sentence)
         else:
             last.setdefault(a.name, None)
     return tuple(changes)
@@ -191,8 +201,7 @@ def spans(history: History) -> list[tuple[str, AlarmState, int, int, str]]:
         changes = [a for a in history.alarms if a.name == name]
         ends = [a.time_ns for a in changes[1:]] + [max(history.end_ns, changes[-1].time_ns)]
         found += [
-            (name, a.state, a.time_ns, end, a.sentence)
-            for a, end in zip(changes, ends, strict=True)
+            (name, a.state, a.time_ns, end, a.words) for a, end in zip(changes, ends, strict=True)
         ]
     return found
 
@@ -295,7 +304,7 @@ def alarms_table(history: History) -> str:
         return ''
     shown = history.alarms[-_MOST:]
     rows = [
-        [say.moment(a.time_ns), _row_of(a.name), _WORDS[a.state], html.text(a.sentence)]
+        [say.moment(a.time_ns), _row_of(a.name), _WORDS[a.state], html.text(a.words)]
         for a in shown
     ]
     stood, until = 0, -(1 << 62)  # ns in which the condition of any alarm held
