@@ -177,7 +177,8 @@ def topics(bench: Bench) -> None:
         late = '--once --qos-durability transient_local --qos-reliability reliable'
         for sentence, pattern, words in (
             ('A late subscriber sees that no alarm ever came',
-             'state: 0.*not raised since the start', f'topic echo {late} {_NODE}/alarms'),
+             'state: 0.*Not raised since the monitor started',
+             f'topic echo {late} {_NODE}/alarms'),
             ('The first curve message has a time', r'sec: (1[0-9]{9})',
              f'topic echo {late} {_NODE}/characteristic'),
             ('The quality of service is as overridden', '(Reliability: BEST_EFFORT)',

@@ -149,7 +149,7 @@ def test_who_comes_late_finds_everything_with_a_time(live, begun_ns):
     told = messages(first, Alarm, 'alarms')
     assert {alarm.name for alarm in told} == {'residual', 'curve_shift'}
     for alarm in told:
-        assert alarm.sentence == 'The alarm was not raised since the start.'
+        assert alarm.sentence == 'Not raised since the monitor started.'
         assert (alarm.state, alarm.previous_state, alarm.occurrence) == (Alarm.NORMAL,) * 2 + (0,)
 
 

@@ -92,7 +92,7 @@ def _never(name: str, time_ns: int) -> AlarmChange:
     normal = AlarmState.NORMAL
     return AlarmChange(
         time_ns, name, normal, normal, Priority.MEDIUM, math.nan, math.nan, '',
-        'The alarm was not raised since the start.', 0, 0, '',
+        'Not raised since the monitor started.', 0, 0, '',
     )  # fmt: skip
 
 
