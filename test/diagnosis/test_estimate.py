@@ -119,7 +119,10 @@ def test_a_place_on_the_curve_is_told_in_mw_or_as_an_opening():
     step = FittedCause(catalogue()['curve_step'], STEPS['curve_step'])
     model = Extended(base, (step,))
     by_power = step.sentence(ORIGIN_NS, place=model.place_words(StaticForm()))
-    assert 'gives 4 MW less above 240 MW than before, and the same below 200 MW' in by_power
+    assert (
+        'gives 4 MW less above 240 MW than before, and nothing has changed below 200 MW'
+        in by_power
+    )
     assert model.place_words(StaticForm())(9e9) == '300 MW'  # beyond the curve
     by_opening = model.place_words(StaticForm(OPENING, 1.0))
     assert 'above 62.5 % opening than' in FittedCause(

@@ -134,8 +134,8 @@ def curve_step_sentence(values: SentenceValues) -> str:
     return (
         f'From {values.onset} the unit gives {abs(values["s_mw"]):.2g} MW '
         f'{"less" if values["s_mw"] < 0.0 else "more"} above {values.place(full)} than before, '
-        f'and the same below {values.place(values["u_from"])} (a valve that sticks, or another '
-        'order of opening).'
+        f'and nothing has changed below {values.place(values["u_from"])} (a valve that sticks, or '
+        'another order of opening).'
     )
 
 
