@@ -269,10 +269,10 @@ def test_confidence_and_support_stand_in_the_page(identified):
 def test_quality_tells_what_was_not_used(identified):
     counts = {'generated_power': {'accepted': 90, 'impossible': 7, 'late': 3, 'duplicate': 0}}
     words = words_of(identification_report(replace(identified, counts=counts)))
-    assert 'Readings not used: 7 impossible value.' in words
-    assert '97 7 impossible value, 3 too late for its row (used later)' in words
+    assert 'Readings not used: 7 outside the accepted range.' in words
+    assert '97 7 outside the accepted range, 3 too late for its row (used later)' in words
     assert 'all used' in words
-    assert 'time given twice' not in words
+    assert 'the same time' not in words
 
 
 # Against a reference.

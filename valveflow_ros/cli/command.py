@@ -448,12 +448,17 @@ def table(rows: Sequence[Sequence[str]], head: Sequence[str]) -> str:
     return columns(rows, head) if rows else ''
 
 
-def rejected_words(counts: Mapping[str, Mapping[str, int]]) -> str:
-    """Return one line per signal about the readings that were not used."""
+def rejected_words(
+    counts: Mapping[str, Mapping[str, int]], ranges: Mapping[str, str] | None = None
+) -> str:
+    """Return one line per signal about the readings that were not used.
+
+    ``ranges`` has the accepted range of each signal in words, which is then added.
+    """
     from valveflow_ros.report.data import reason_words, rejected
 
     told = [
-        f'  {topic}: {reason_words(refused)}'
+        f'  {topic}: {reason_words(refused, (ranges or {}).get(topic, ""))}'
         for topic, by_reason in counts.items()
         if (refused := rejected({topic: by_reason}))
     ]

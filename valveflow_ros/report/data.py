@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from valveflow_ros.report.identified import Identified
 
 
-# The reasons of the aligner in plain words, in the order of the table.
+# The reasons of the aligner in words that follow a number of readings, in the order of the table.
 REASON_WORDS = {
     'not_finite': 'not a number',
     'bad_quality': 'marked bad by the sender',
-    'impossible': 'impossible value',
-    'duplicate': 'time given twice',
+    'impossible': 'outside the accepted range',
+    'duplicate': 'with the same time as the one before',
     'out_of_order': 'older than the one before',
-    'time_outlier': 'time far from all others',
+    'time_outlier': 'with a time far from all others',
     'late': 'too late for its row (used later)',
 }
 _NEEDED = ('valve_opening', 'main_steam_pressure', 'generated_power')
@@ -75,9 +75,15 @@ def rejected(counts: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
     return {reason: n for reason, n in total.items() if n}
 
 
-def reason_words(counts: Mapping[str, int]) -> str:
-    """Return the readings of each reason in words; empty if there are none."""
-    told = ((counts.get(reason, 0), words) for reason, words in REASON_WORDS.items())
+def reason_words(counts: Mapping[str, int], accepted: str = '') -> str:
+    """Return the readings of each reason in words; empty if there are none.
+
+    ``accepted`` is the accepted range in words, to be added.
+    """
+    found = dict(REASON_WORDS)
+    if accepted:
+        found['impossible'] += f' ({accepted})'
+    told = ((counts.get(reason, 0), words) for reason, words in found.items())
     return ', '.join(f'{say.count(n)} {words}' for n, words in told if n)
 
 

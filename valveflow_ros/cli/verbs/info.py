@@ -43,8 +43,9 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     if not options.json and (told := _summary(options.log)):
         console.say(told)
     from valveflow_ros.interface.logs import open_log, steps_of
+    from valveflow_ros.interface.plausibility import limits
     from valveflow_ros.interface.settings import settings_for
-    from valveflow_ros.records import SIGNALS
+    from valveflow_ros.records import SIGNALS, Signal
 
     log = open_log(options.log, mapping, progress=console)
     parts = log.recorded.by_signal()
@@ -97,11 +98,18 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
         'damaged_chunks': contents.damaged_chunks,
         'warnings': list(log.notes),
     }
+    ranges = {}
+    for signal in parts:
+        low, high = limits(Signal(signal), settings)
+        topic = SIGNALS[signal].topic
+        ranges[topic] = f'{low:g} to {high:g} {signals[topic]["unit"]}'
     name = contents.path if options.log.name not in ('', '..') else log.name
-    return command.VerbResult(_text(str(name), data, signals), data)
+    return command.VerbResult(_text(str(name), data, signals, ranges), data)
 
 
-def _text(name: str, data: dict[str, Any], signals: dict[str, dict[str, Any]]) -> str:
+def _text(
+    name: str, data: dict[str, Any], signals: dict[str, dict[str, Any]], ranges: dict[str, str]
+) -> str:
     from valveflow_ros.records import SIGNALS
     from valveflow_ros.report.words import count, counted, duration, moment, plain
 
@@ -152,7 +160,7 @@ def _text(name: str, data: dict[str, Any], signals: dict[str, dict[str, Any]]) -
         command.table(topics, ['topic', 'type', 'messages', 'rate']),
         command.table(rows, head),
         f'Not in the log: {", ".join(absent)}.' if absent else '',
-        command.rejected_words(data['readings']),
+        command.rejected_words(data['readings'], ranges),
         *(f'{which}: {gaps}' for which, gaps in found.items()),
         'No gaps.' if signals and not found else '',
         f'Attached: {attached}.' if attached else '',
