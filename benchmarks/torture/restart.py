@@ -137,7 +137,7 @@ def _killed_and_started(
 
 def _times_gone_on(folder: Path) -> int:
     """Count by the log; the line in the journal may come before anybody listens."""
-    return (folder / 'monitor.log').read_text(errors='replace').count('Going on after')
+    return (folder / 'monitor.log').read_text(errors='replace').count('The saved state was loaded')
 
 
 def _judge(plant: Plant, folder: Path, outcome: Outcome) -> None:

@@ -73,7 +73,9 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(processes, lis
     monitor.kill()
     monitor.wait()
     monitor = start_monitor(processes, tmp_path / 'recordings', **MINUTES)
-    listener.until(lambda: 'Going on after' in processes.output(monitor), 'the restart')
+    listener.until(
+        lambda: 'The saved state was loaded' in processes.output(monitor), 'the restart'
+    )
     listener.health.clear()
     assert player.wait_for_listeners(240.0) == []
     player.play(played)

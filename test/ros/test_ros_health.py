@@ -226,10 +226,10 @@ def test_an_input_of_which_nothing_can_be_used_is_as_good_as_silent():
     for second in (1, 10, 11, 29):
         scene.hear(OPENING, NOW + second)
         counts['impossible'] += 1
-        level, words = Level.WARN, '1 new readings were rejected.'
+        level, words = Level.WARN, '1 new reading was rejected.'
         if second > 10:
             level = Level.ERROR
-            words = f'Nothing usable has come for {second} s. In all runs so far: impo'
+            words = f'Nothing usable has come for {second} s. Rejected in all runs so far: '
         scene.says(level, words, at=NOW + 0.5 + second)
     # One good one among them is enough.
     counts['accepted'] += 1
@@ -249,14 +249,14 @@ def test_losses_are_said_once_and_counted_on():
 def test_an_impossible_value_is_told_as_sent_with_the_unit_it_would_fit():
     for stamped, settings, topic, value, words in (
         (False, {}, PRESSURE, 162.5,
-         '1 new readings were rejected. The last one, 162.5 MPa, is impossible (believed: 0.05 to '
+         '1 new reading was rejected. The last one, 162.5 MPa, is impossible (accepted: 0.05 to '
          "40 MPa). It would be possible in bar: set main_steam_pressure_unit to 'bar'."),
         (False, {'valve_opening_unit': 'fraction'}, OPENING, 6500.0,
          'The last one, 65 fraction, is impossible'),
         (False, {'valve_opening_unit': 'fraction'}, OPENING, 6500.0,
          "possible in %: set valve_opening_unit to 'percent'."),
         (True, {'valve_opening_unit': 'fraction'}, OPENING, 650.0,
-         '650 %, is impossible (believed: -2 to'),
+         '650 %, is impossible (accepted: -2 to'),
         (True, {'main_steam_pressure_unit': 'bar'}, PRESSURE, 124.86,
          'It would be possible in bar: convert to MPa before sending.'),
     ):  # fmt: skip
@@ -275,7 +275,10 @@ def test_other_rejections_are_told_by_reason_and_those_of_earlier_runs_are_no_ne
     scene.health.begin(scene.counts)
     scene.says(Level.OK, '1 Hz.')
     counts['not_finite'] = 4
-    told = '4 new readings were rejected. In all runs so far: not finite 4, duplicate 40.'
+    told = (
+        '4 new readings were rejected. Rejected in all runs so far: 4 not a number, '
+        '40 with the same time as the one before.'
+    )
     scene.says(Level.WARN, told)
     counts['bad_quality'] = 4
     scene.says(

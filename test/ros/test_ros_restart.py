@@ -110,7 +110,7 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     third = start_monitor(processes, tmp_path, **given, alarm_floor=2.0)
     found = plant.until(lambda: plant.curves and plant.curves[-1], 'the curve')
     assert found.model_id == curve.model_id
-    plant.until(lambda: 'Going on after' in processes.output(third), 'the sentence')
+    plant.until(lambda: 'The saved state was loaded' in processes.output(third), 'the sentence')
     # Who listens from now on finds what stands, as it was told before: nothing in it is new.
     plant.until(lambda: len(plant.alarms) > before, 'the standing alarm')
     plant.quiet(0.5)

@@ -78,9 +78,11 @@ def test_only_one_at_a_time_and_the_next_as_soon_as_it_is_gone(tmp_path):
 
 def test_a_state_of_other_parameters_is_used_unless_it_is_of_another_unit(tmp_path):
     for k, (more, words) in enumerate((
-        ({'generated_power_unit': 'kW'}, 'It was made with another generated_power_unit.'),
+        ({'generated_power_unit': 'kW'},
+         "It was made with another generated_power_unit ('MW' instead of 'kW')."),
         ({'main_steam_pressure_unit': 'bar', 'model_file': 'x', 'block': 20.0},
-         'It was made with another main_steam_pressure_unit and model_file.'),
+         "It was made with another main_steam_pressure_unit ('MPa' instead of 'bar') and "
+         "model_file ('' instead of 'x')."),
         ({'block': 20.0, 'window_days': 5.0, 'sample_period': 2.0}, ''),
         ({'alarm_limit': 3.0, 'refit_period': 60.0, 'record_keep': 5}, ''),
     )):  # fmt: skip
@@ -376,7 +378,12 @@ def test_each_output_stands_in_the_recording_once(said, again, recorded):
     assert found is engine
     assert (ours.folder, ours.log_ns) == (Path('folder'), LOG_NS if said else 1)
     assert list(ours.begin(given, engine, outputs)) == again
-    assert logged == [(Level.OK, 'Going on after 0 rows of an earlier run.')]
+    (loaded,) = logged
+    assert loaded[0] == Level.OK
+    assert loaded[1] == (
+        'The saved state was loaded, with 0 rows (0 s); '
+        'the recording continues in the same folder.'
+    )
 
 
 @pytest.mark.usefixtures('recorded')

@@ -21,6 +21,7 @@ from valveflow_ros.monitoring.curves import CurveStatus
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, SignalInfo
+from valveflow_ros.report.data import reason_words
 from valveflow_ros.report.words import duration
 from valveflow_ros.ros.decoding import INPUT_BY_NAME, PLANT_SAMPLE, Row
 from valveflow_ros.ros.encoding import NOT_YET
@@ -219,6 +220,8 @@ class InputHealth:
             if now_s - since_s > _BLIND_S:
                 blind_s = now_s - since_s
                 return Level.ERROR, f'Nothing usable has come for {blind_s:.0f} s. {why}'
+            if rejected == 1:
+                return Level.WARN, f'1 new reading was rejected. {why}'
             return Level.WARN, f'{rejected} new readings were rejected. {why}'
         if received.without_time + received.waiting == received.received:
             return Level.ERROR, f'{topic} comes without a time; is /clock published?'
@@ -285,8 +288,8 @@ class InputHealth:
                     'The sender marked them as bad quality, or does not set '
                     f'{info.topic}_quality, which is then 0, unknown; 1 is good.'
                 )
-            reasons = [f'{r.replace("_", " ")} {counts[r]}' for r in _REJECTED if counts[r]]
-            return f'In all runs so far: {", ".join(reasons)}.'
+            told = reason_words({r: counts[r] for r in _REJECTED})
+            return f'Rejected in all runs so far: {told}.'
         name, value = found
         low, high = self._ranges[info.signal]
         stamped = name == PLANT_SAMPLE
@@ -295,7 +298,7 @@ class InputHealth:
         sent = (value - unit.offset) / unit.scale
         text = (
             f'The last one, {sent:g} {named}, is impossible '
-            f'(believed: {low:g} to {high:g} {info.unit}).'
+            f'(accepted: {low:g} to {high:g} {info.unit}).'
         )
         fitting = better_units(info.signal, np.array([sent]), named, (low, high))
         if not fitting or self.settings.output_unit != 'MW':

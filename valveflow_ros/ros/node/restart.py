@@ -18,6 +18,7 @@ from valveflow_ros.monitoring.events import Event, JournalEntry, JournalKind
 from valveflow_ros.monitoring.offline import JournalReplayer
 from valveflow_ros.parameters import Settings, parameter
 from valveflow_ros.records import Readings
+from valveflow_ros.report.words import duration
 from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, journal_entry
 from valveflow_ros.ros.node.diagnostics import Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine
@@ -130,7 +131,14 @@ class Restart:
         yield from outputs.of(monitor.resume(REASON))
         yield from outputs.of(events if retuned else monitor.reconfigure(settings))
         self._tail.clear()
-        self._log(Level.OK, f'Going on after {monitor.rows} rows of an earlier run.')
+        rows, past_s = monitor.rows, monitor.rows * monitor.settings.real('sample_period')
+        then = 'the recording continues in the same folder'
+        if self.folder is None:
+            then = 'a new recording is begun'
+        self._log(
+            Level.OK,
+            f'The saved state was loaded, with {rows} rows ({duration(past_s)}); {then}.',
+        )
         for last in (monitor.alarm.last, monitor.reference.alarm.last):
             if last is not None and last.state != AlarmState.NORMAL and (line := line_of(last)):
                 self._log(line[0], f'from before, {line[1]}')

@@ -422,7 +422,9 @@ class StateStore:
                 folder.swap_aside()
                 return
         if others := _changed(self.saved, settings, Depends.ALL):
-            self.drop(f'It was made with another {listed(others)}.', whole=True)
+            then: Settings = self.saved['settings']
+            told = [f'{n} ({then[n]!r} instead of {settings[n]!r})' for n in others]
+            self.drop(f'It was made with another {listed(told)}.', whole=True)
         else:
             folder.set_aside(of_use=True)
 
