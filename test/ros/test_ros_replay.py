@@ -21,7 +21,7 @@ from valveflow_ros.ros.decoding import INPUT_BY_NAME, header_time_ns
 from valveflow_ros.ros.encoding import encode, float64_bytes
 from valveflow_ros.ros.node.intake import ClockTrack
 from valveflow_ros.ros.node.polled_subscription import PolledSubscription
-from valveflow_ros.ros.replay_main import steps_of
+from valveflow_ros.ros.replay_main import main, steps_of
 from valveflow_ros.ros.simulator_main import (
     check_together,
     effects_of,
@@ -105,6 +105,16 @@ def test_a_recording_and_a_table_of_the_same_samples_give_the_same_steps(tmp_pat
     sorted_steps = [(step.time_ns, sorted(step.messages)) for step in steps]
     assert sorted_steps == [(step.time_ns, sorted(step.messages)) for step in steps_of_table]
     assert [time_ns for time_ns, _ in sorted_steps] == TABLE.time_ns.tolist()
+
+
+def test_a_table_that_needs_options_is_to_be_imported_first(tmp_path, capsys):
+    path = tmp_path / 'log.csv'
+    write_table(TABLE, path)
+    path.write_text(path.read_text().replace('valve_opening_percent', 'FV101', 1))
+    assert main([str(path)]) == 1
+    said = capsys.readouterr().err
+    assert 'Name yours with --column valve_opening=THEIRS[:unit]' in said
+    assert f'make a log of the table first, with valveflow import {path} -o' in said
 
 
 def with_a_hole(table):

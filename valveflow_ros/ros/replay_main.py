@@ -17,6 +17,7 @@ from rclpy.utilities import remove_ros_args
 from valveflow_ros.errors import DataError, ValveflowError, counted
 from valveflow_ros.logs import LogContents, open_log
 from valveflow_ros.logs.names import has_earlier_codes, told_inputs
+from valveflow_ros.logs.tables.refusal import RefusedError, quoted
 from valveflow_ros.records import SIGNALS
 from valveflow_ros.report.terminal.progress import Progress
 from valveflow_ros.report.terminal.text import number
@@ -187,7 +188,13 @@ def _verify(path: str) -> int:
 def _replay(options: argparse.Namespace, stop: StopFlag) -> int:
     node: Node | None = None
     try:
-        log = open_log(options.log)
+        try:
+            log = open_log(options.log)
+        except RefusedError as error:
+            raise DataError(
+                f'{error}\nreplay has no such options: make a log of the table first, with '
+                f'valveflow import {quoted(options.log)} -o LOG.mcap and these options.'
+            ) from None
         names, steps = steps_of(log)
         node = Node('replay')
         say = node.get_logger()
