@@ -211,7 +211,8 @@ _PLAUSIBLE = (
 )  # fmt: skip
 
 _TIME_BASE = (
-    Parameter('sample_period', 1.0, 's', 'Step of the sample table.', 0.01, 3600.0),
+    Parameter('sample_period', 1.0, 's',
+              'Time between samples: set it to the interval of your data.', 0.01, 3600.0),
     Parameter('hold_limit', 10.0, 's',
               'A value is used for at most this time; then the signal is stale and the sample '
               'is bad.',
@@ -283,7 +284,8 @@ _FIT = (
               'Refit after this many new special segments; 0 waits for the period.',
               0, 100000, live=True),
     Parameter('refit_share', 0.1, '',
-              'No refit before this share of the special segments in the window is new.',
+              'A refit waits until this share of the special segments in the window (steady '
+              'states and long ramps) has come since the last fit.',
               0.0, 1.0, live=True),
     Parameter('refit_timeout', 120.0, 's', 'A refit that takes longer is ended.', 1.0, 3600.0),
     Parameter('min_fit_samples', 600, '', 'Fewest special samples a fit needs.', 10, 10_000_000),
@@ -291,7 +293,8 @@ _FIT = (
 
 _ALARM = (
     Parameter('alarm_run_length', 30.0, 'd',
-              'Mean time between false residual alarms; limits follow from the clean residual.',
+              'Accepted mean time between false residual alarms: a longer one gives wider limits, '
+              'so fewer false alarms and later true ones.',
               0.5, 3650.0, live=True),
     Parameter('alarm_block', 60.0, 's', 'Length of the means of the residual for the alarm.',
               1.0, 86400.0, live=True),
@@ -306,8 +309,9 @@ _ALARM = (
     Parameter('alarm_on_delay', 900.0, 's', 'The limit must be exceeded this long.',
               0.0, 86400.0, live=True),
     Parameter('alarm_off_delay', 86400.0, 's',
-              'The return must last this long, at openings where the alarm was seen; twice as '
-              'long each time that it comes back within seven of these times, at most eight.',
+              'The alarm ends when the residual has been within its limit for this long, at '
+              'openings where the alarm was seen. If the alarm comes back soon (within seven of '
+              'these times), this time doubles, up to eight times its value.',
               0.0, 864000.0, live=True),
     Parameter('alarm_dead_band', 0.3, '', 'The return is judged at limit x (1 - dead band).',
               0.0, 0.9, live=True),
@@ -317,9 +321,10 @@ _ALARM = (
               'A shelved alarm comes back by itself after this time.',
               60.0, 604800.0, live=True),
     Parameter('alarm_suppress_time', 3600.0, 's',
-              'The residual alarm is suppressed when it could not be judged for this long; it '
-              'comes back when it could be for the shorter of alarm_off_delay and five '
-              'alarm_block, or at once if it changes.',
+              'If the residual could not be judged for this long, for example because an input is '
+              'missing, its alarm is suppressed. The alarm is shown again when the residual has '
+              'been judged for alarm_off_delay or five alarm_block, whichever is shorter, or at '
+              'once if the alarm changes.',
               1.0, 86400.0, live=True),
     Parameter('alarm_flood', 5, '',
               'Most announcements of one alarm in ten minutes; more are counted and not sent.',
@@ -340,7 +345,8 @@ _SHIFT = (
               'How sure a shift of the curve must be before it is called one.',
               0.9, 0.999999, live=True),
     Parameter('shift_least', 0.3, 'MW',
-              'Smaller shifts of the curve do not count; the monitor adds wear within its budget.',
+              'A shift of the curve smaller than this raises no alarm. The wear that wear_budget '
+              'allows since the reference was set is added to it.',
               0.0, 1e4, live=True),
 )  # fmt: skip
 
