@@ -69,7 +69,9 @@ def test_an_input_that_stops_is_silent_and_one_that_cannot_be_is_rejected(tmp_pa
     assert '30 readings rejected, the last 700.0 %' in found['valve_opening'].sentence
     assert found['main_steam_pressure'].level == OK
     assert found['generated_power'].level == STALE
-    assert found['generated_power'].sentence == 'silent for 30 s.'
+    assert found['generated_power'].sentence == (
+        'the recording has ended; no value in its last 30 s.'
+    )
 
 
 def test_a_clock_that_goes_back_begins_the_residuals_anew(tmp_path):

@@ -99,7 +99,7 @@ def test_everything_is_on_a_usual_terminal():
     text = re.sub(r'\n +', ' ', '\n'.join(screen(FULL, 80, 24)))
     for part in (
         'U1', '2023-11-14 22:18:20', 'fresh, 2 pieces', '1\u202f234 samples', '5 min old', '●',
-        'o breakpoint', 'Residual', 'limits −3.0 to +3.0', '25 % of the way',
+        'o breakpoint', 'Residual', 'limits −3.0 to +3.0', 'alarm at 25 % of its limit',
         'ALARM, not acknowledged, raised 2023-11-14 22:13 UTC',
         'The unit gives 5 MW less.', 'opening 1 Hz', 'Recording.', 'cause named (stiction)',
         'It sticks.', '290 MW', '150 MW',

@@ -36,7 +36,7 @@ NEEDS = {'page': 'dash', 'opcua_gateway': 'asyncua'}
 # What each says once it works.
 WORKS = {
     'monitor': r'U1: listening to .*; recording to /', 'page': 'The page is at',
-    'watch': 'Waiting for /unit1/valveflow_monitor', 'replay': 'Playing plant.mcap',
+    'watch': 'No monitor /unit1/valveflow_monitor was found', 'replay': 'Playing plant.mcap',
     'plant_simulator': 'wrong with it: gain_step', 'opcua_gateway': 'opc.tcp://127.0.0.1:9',
 }  # fmt: skip
 

@@ -119,7 +119,8 @@ def test_the_whole_life(staged, tmp_path):
         assert reliability('/valve_opening') == wanted
         assert reliability('/main_steam_pressure') == 'reliable'
         answer = stage.call(Trigger, 'refit', Trigger.Request())
-        assert answer.message == 'There is no special segment to fit yet.'
+        assert answer.message.startswith('There is no special segment (steady state or long')
+        assert answer.message.endswith('a fit needs 600 samples in such segments.')
         assert stage.sentence('input valve_opening').startswith('Waiting for /valve_opening')
         unknown = "'qos_overrides./valve_openin.subscription.depth' is for no topic"
         assert unknown in stage.sentence('parameters')

@@ -155,7 +155,7 @@ def test_a_monitor_that_is_killed_and_started_again(processes, port, browser):
 
         wait_until(found, text, 90.0)
 
-    shows('Waiting for a monitor.')
+    shows('No monitor was found yet.')
     words = ('--ros-args', '-p', 'unit_tag:=U7', '-p', 'record:=false', '-p', 'keep_state:=false')
     plant = ('-p', 'stamped:=true', '-p', 'rate:=20.0', '-p', 'days:=0.1')
     monitor = processes.start('valveflow_ros.ros.monitor_main', *words)

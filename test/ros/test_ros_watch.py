@@ -94,7 +94,7 @@ def executor(context):
 
 
 def test_what_the_monitor_says_is_shown(speaker, watch, executor):
-    assert watch.frame().note.startswith('Waiting for a monitor.')
+    assert watch.frame().note.startswith('No monitor was found yet.')
     executor.add_node(watch)
 
     def complete():
@@ -212,7 +212,7 @@ def test_a_monitor_that_does_not_answer_is_told(
     speaker = Speaker(context) if there else None
     executor.add_node(watch)
     assert watch_main._ask(watch, executor, 'refit', '') == 1
-    told = '/valveflow_monitor does not answer' if there else 'Waiting for a monitor.'
+    told = '/valveflow_monitor does not answer' if there else 'No monitor was found yet.'
     assert told in capsys.readouterr().err
     if speaker is not None:
         speaker.destroy_node()

@@ -92,26 +92,31 @@ class InputWatch:
             track.refused = float(values[wrong[-1]])
             track.refused_ns = int(rows.log_time[wrong[-1]])
 
-    def health(self, newest_ns: int) -> tuple[HealthView, ...]:
+    def health(self, newest_ns: int, finished: bool = False) -> tuple[HealthView, ...]:
         """Return the health of each signal; an optional signal without readings is left out.
 
-        ``newest_ns`` is the newest log time of the whole recording.
+        ``newest_ns`` is the newest log time of the whole recording, ``finished``: no more will
+        come.
         """
         if not newest_ns:
             return ()
         return tuple(
-            self._judged(info.signal, newest_ns)
+            self._judged(info.signal, newest_ns, finished)
             for info in SIGNALS
             if info.required or info.signal in self._tracks
         )
 
-    def _judged(self, signal: Signal, newest_ns: int) -> HealthView:
+    def _judged(self, signal: Signal, newest_ns: int, finished: bool) -> HealthView:
         info, track = SIGNALS[signal], self._tracks.get(signal)
         if track is None:
             return HealthView(info.topic, STALE, 'nothing of it is in the recording.')
         silent_s = (newest_ns - track.last_ns) / NS_PER_S
         if silent_s > max(_SILENT_S, _SILENT_STEPS * track.step_s):
-            return HealthView(info.topic, STALE, f'silent for {duration(round(silent_s))}.')
+            silent = duration(round(silent_s))
+            told = f'silent for {silent}.'
+            if finished:
+                told = f'the recording has ended; no value in its last {silent}.'
+            return HealthView(info.topic, STALE, told)
         if track.rejected and newest_ns - track.refused_ns < _TOLD_S * NS_PER_S:
             value = plain(track.refused)
             why = (
@@ -180,7 +185,7 @@ class LogWatch:
         """Return the present state."""
         while self._predictions:
             self._tell(self._predictions.popleft())
-        self._board.inputs = self._inputs.health(self._newest_ns)
+        self._board.inputs = self._inputs.health(self._newest_ns, self.finished)
         self._board.recorder = self._recorder()
         return self._board.frame(self._name, self._note())
 

@@ -33,6 +33,11 @@ class CurveStatus(enum.IntEnum):
     PROVISIONAL = 4
 
 
+NO_CURVE_YET = (
+    'No curve yet: not enough samples in steady states and long ramps; min_fit_samples are needed.'
+)
+
+
 class RunningCurve:
     """The curve of the last fit, and the predictor.
 
@@ -53,7 +58,7 @@ class RunningCurve:
         self._predictor: Predictor | None = None
         self.characteristic: Characteristic | None = None
         self.status = CurveStatus.UNKNOWN
-        self.cause = 'No curve yet: not enough special segments.'
+        self.cause = NO_CURVE_YET
 
     @property
     def predicting(self) -> Characteristic | None:

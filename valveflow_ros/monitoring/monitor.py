@@ -240,7 +240,11 @@ class Monitor(Memory):
         if self.fit_pending:
             raise DataError('A fit is running already.')
         if not self._window.special_segments(self.reference.regime_ns):
-            raise DataError('There is no special segment to fit yet.')
+            least = self.settings.whole('min_fit_samples')
+            raise DataError(
+                'There is no special segment (steady state or long ramp) to fit yet; a fit needs '
+                f'{least} samples in such segments.'
+            )
         return self._ask(BY_HAND)
 
     def request_diagnosis(self) -> list[Event]:

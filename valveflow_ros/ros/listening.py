@@ -46,8 +46,8 @@ def monitors(node: Node) -> list[str]:
 def waiting_for(monitor: str) -> str:
     """Return the advice for the case that no monitor is found."""
     return (
-        f'Waiting for {monitor or "a monitor"}. If one runs, compare ROS_DOMAIN_ID and '
-        'ROS_AUTOMATIC_DISCOVERY_RANGE here and there: they must be the same.'
+        f'No monitor{" " if monitor else ""}{monitor} was found yet. If it runs, compare '
+        'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE here and there: they must be the same.'
     )
 
 

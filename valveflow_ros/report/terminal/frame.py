@@ -116,7 +116,7 @@ def _word(words: tuple[str, ...], number: int) -> str:
 
 # A sentence and its style, one of `text.TONES` or '' for plain.
 Said = tuple[str, str]
-NONE_YET = 'None yet.'
+NO_CURVE = 'There is no curve yet.'
 _SHORT = {
     'valve_opening': 'opening', 'main_steam_pressure': 'pressure',
     'main_steam_temperature': 'temperature', 'generated_power': 'power',
@@ -128,9 +128,9 @@ _TONES = {OK: '', WARN: 'warn', STALE: 'bad'}
 def curve_words(curve: CurveView | None, now_ns: int) -> Said:
     """Return the age and the data of the curve in words."""
     if curve is None:
-        return NONE_YET, 'warn'
+        return NO_CURVE, 'warn'
     if not curve.breakpoints:
-        return curve.cause or NONE_YET, 'warn'
+        return curve.cause or NO_CURVE, 'warn'
     first, last = curve.window
     told = [
         f'{_word(CURVE_STATES, curve.state)}, {counted(len(curve.breakpoints) - 1, "piece")}',
@@ -150,7 +150,7 @@ def curve_words(curve: CurveView | None, now_ns: int) -> Said:
 def sample_words(sample: SampleView | None) -> Said:
     """Return the position of the last sample relative to the curve in words."""
     if sample is None:
-        return NONE_YET, 'dim'
+        return 'There is no prediction yet, so no residual.', 'dim'
     state = _word(SAMPLE_STATES, sample.state)
     if not math.isfinite(sample.residual_mw):
         return f'{state}.', 'bad' if sample.state == BAD_DATA else 'dim'
@@ -161,7 +161,7 @@ def sample_words(sample: SampleView | None) -> Said:
     if math.isfinite(sample.average_mw):
         text += f', mean {signed(sample.average_mw)}'
     if math.isfinite(sample.evidence):
-        text += f', {decimals(100.0 * abs(sample.evidence), 0)} % of the way to an alarm'
+        text += f', residual alarm at {decimals(100.0 * abs(sample.evidence), 0)} % of its limit'
     return f'{text}.', '' if inside or sample.state == OUTSIDE else 'warn'
 
 
@@ -215,7 +215,7 @@ def recorder_words(frame: Frame) -> Said:
 def diagnosis_words(diagnosis: DiagnosisView | None) -> Said:
     """Return the result of the last diagnosis in words."""
     if diagnosis is None:
-        return NONE_YET, 'dim'
+        return 'There is no diagnosis yet.', 'dim'
     if not diagnosis.verdict and diagnosis.sentence:
         return diagnosis.sentence, 'dim'
     names = f' ({", ".join(diagnosis.causes)})' if diagnosis.causes else ''

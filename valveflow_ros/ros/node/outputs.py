@@ -34,7 +34,7 @@ from valveflow_ros.monitoring.alarms import (
     ResidualAlarm,
     ShiftAlarm,
 )
-from valveflow_ros.monitoring.curves import CurveStatus
+from valveflow_ros.monitoring.curves import NO_CURVE_YET, CurveStatus
 from valveflow_ros.monitoring.events import JournalKind
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.prediction import PredictionBlock
@@ -44,7 +44,6 @@ from valveflow_ros.signals.static_form import OPENING
 from valveflow_ros.signals.units import in_unit
 
 ALARMS = (ResidualAlarm.NAME, ShiftAlarm.NAME)
-NO_CURVE_YET = 'No curve yet: not enough special segments.'
 
 
 @dataclass(frozen=True, slots=True)
