@@ -74,6 +74,9 @@ BAD_FILES = [
     ('valveflow_monitor:\n  delay: 3.0\n', ['Put the lines']),
     ('/**:\n  ros__parameters: 3\n', ['Put the lines']),
     ('/**:\n  ros__parameters:\n  delay: 3.0\n', ['Put the lines']),
+    ('monitor:\n  ros__parameters:\n    delay: 3.0\n/u1/page:\n  ros__parameters:\n    a: 1\n',
+     ["no section for the node valveflow_monitor, only 'monitor' and '/u1/page'",
+      "Name the section '/**:' or 'valveflow_monitor:'"]),
 ]  # fmt: skip
 
 
@@ -83,6 +86,15 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path):
         file.write_text(text)
         sentence = run('config', 'check', file).refused()
         assert all(part in sentence for part in ['x.yaml', *parts]), text
+
+
+def test_only_sections_for_the_monitor_count(run, tmp_path):
+    file = tmp_path / 'x.yaml'
+    file.write_text(
+        "'/*/valveflow_monitor':\n  ros__parameters:\n    delay: 3.0\n"
+        'opcua_gateway:\n  ros__parameters:\n    mapping_file: opcua.yaml\n'
+    )
+    assert '1 parameter, 1 differs from its default' in run('config', 'check', file).out
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 import yaml
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from ros_helpers import wait_until
 
 from valveflow_ros.errors import ParameterError
+from valveflow_ros.interface.settings import unmatched_files
 from valveflow_ros.parameters import TABLE, Settings, as_yaml
 from valveflow_ros.ros.declare import changed, declare, unknown_overrides
 from valveflow_ros.ros.node.diagnostics import Level
@@ -191,6 +193,46 @@ def test_misspelt_parameters_are_named(context):
     assert (item.name, item.level) == ('parameters', Level.WARN)
     assert item.sentence == f'{sentence} It is ignored.'
     node.destroy_node()
+
+
+# Names of sections, and of the nodes to which each of them applies.
+HERE, THERE, DEEP = '/valveflow_monitor', '/u1/valveflow_monitor', '/a/u1/valveflow_monitor'
+SECTIONS = {
+    '/**': {HERE, THERE, DEEP}, '**': {HERE, THERE, DEEP}, 'valveflow_monitor': {HERE},
+    HERE: {HERE}, '/*': {HERE}, 'u1/valveflow_monitor': {THERE}, '/u1/*': {THERE},
+    '/u1/**': {THERE}, '/*/valveflow_monitor': {THERE}, '/**/valveflow_monitor':
+    {HERE, THERE, DEEP}, 'monitor': set(), '/valveflow_monitor/*': set(),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures('ros_environment')
+def test_a_parameter_file_without_effect_is_told(tmp_path):
+    file = tmp_path / 'x.yaml'
+    for section, nodes in SECTIONS.items():
+        file.write_text(f"'{section}':\n  ros__parameters:\n    delay: 3.0\n")
+        for name in (HERE, THERE, DEEP):
+            namespace = name.removesuffix(HERE) or '/'
+            args = ['--ros-args', '--params-file', str(file), '-r', f'__ns:={namespace}']
+            context = Context()
+            context.init(args)
+            node = Node('valveflow_monitor', context=context)
+            taken = 'delay' in node._parameter_overrides
+            node.destroy_node()
+            assert taken == (name in nodes), (section, name)
+            assert bool(unmatched_files(args, name)) == (not taken), (section, name)
+            context.try_shutdown()
+    args = ['--ros-args', '--params-file', str(file)]
+    context = Context()
+    context.init(args)
+    node = MonitorNode(args=args, context=context)
+    (item,) = node.unknown_parameters()
+    assert item.level == Level.WARN
+    assert item.sentence == (
+        f'The parameter file {file} has no section for the node {HERE}, only '
+        "'/valveflow_monitor/*'. It is ignored."
+    )
+    node.destroy_node()
+    context.try_shutdown()
 
 
 def test_the_clock_cannot_be_taken_over_while_it_runs(running):

@@ -5,13 +5,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from valveflow_ros.errors import InputError, ParameterError, RecordingError, UsageError
+from valveflow_ros.errors import (
+    InputError,
+    ParameterError,
+    RecordingError,
+    UsageError,
+    listed,
+)
 from valveflow_ros.interface.files import reason
 from valveflow_ros.parameters import PARAMETERS, Settings, covariate_columns, parameter
 from valveflow_ros.records import Signal
@@ -20,6 +28,8 @@ _ROUND_S = (1.0, 2.0, 5.0, 6.0, 10.0, 12.0, 15.0, 20.0, 30.0, 60.0, 120.0, 300.0
             1800.0, 3600.0)  # fmt: skip
 # A finished log is fitted once, at its end, in contrast to a live monitor.
 ONE_FIT = {'refit_period': 0.0, 'refit_segments': 0}
+# The name of the monitor's node; the executable is called `monitor`.
+NODE = 'valveflow_monitor'
 _TRUE, _FALSE = ('true', 'yes', 'on'), ('false', 'no', 'off')
 
 
@@ -91,8 +101,9 @@ def read_parameters(
 ) -> dict[str, Any]:
     """Return the user's parameters: the values of the file, overridden by those of ``--set``.
 
-    ``of_node``: the file must have the form of ROS 2, with the values below a node's name. Raises
-    `RecordingError` or `InputError` for the file, `UsageError` for ``--set``.
+    ``of_node``: the file must have the form of ROS 2, with the values below a node's name, and
+    only sections for the monitor count. Raises `RecordingError` or `InputError` for the file,
+    `UsageError` for ``--set``.
     """
     given: dict[str, Any] = {} if file is None else _from_file(file, of_node)
     # A file may list every parameter: only --set makes the usual exponent one to be checked.
@@ -151,6 +162,13 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
             f"{file}: ROS 2 does not take '{stray}' where it stands. Put the lines '/**:' and "
             "'  ros__parameters:' above all parameters, and four blanks before each of them."
         )
+    if of_node and (problem := unmatched(content)):
+        raise InputError(
+            f'{file} {problem}: the monitor would ignore it and run with its defaults. Name the '
+            f"section '/**:' or '{NODE}:'."
+        )
+    if of_node:
+        content = {name: values for name, values in sections(content) if applies(name)}
     given, wrong = {}, []
     for name, value in _flat(content).items():
         try:
@@ -171,6 +189,54 @@ def _without_node(content: dict[Any, Any]) -> str:
         if below:
             return below
     return ''
+
+
+def sections(content: Mapping[Any, Any], above: str = '') -> Iterator[tuple[str, dict[Any, Any]]]:
+    """Yield the name of a node, as the parameter file writes it, and the parameters below it."""
+    for name, inner in content.items():
+        if name == 'ros__parameters':
+            yield above, inner if isinstance(inner, dict) else {}
+        elif isinstance(inner, dict):
+            yield from sections(inner, f'{above}/{name}' if above else str(name))
+
+
+def applies(section: str, node: str = '') -> bool:
+    """Return True if ROS applies a section of a parameter file to a node.
+
+    In the name of a section, * stands for one part of the node's full name and ** for any number
+    of parts. Without ``node`` it is the monitor in any namespace.
+    """
+    parts = [part for part in section.split('/') if part]
+    if not node:
+        return parts[-1:] in ([NODE], ['*'], ['**'])
+    forms = {'*': '/[^/]+', '**': '(/[^/]+)*'}
+    return re.fullmatch(''.join(forms.get(p, f'/{re.escape(p)}') for p in parts), node) is not None
+
+
+def unmatched(content: Mapping[Any, Any], node: str = '') -> str:
+    """Return what is wrong if no section of a parameter file applies to a node; else ''."""
+    names = [name for name, _ in sections(content)]
+    if not names or any(applies(name, node) for name in names):
+        return ''
+    return f'has no section for the node {node or NODE}, only {listed([repr(n) for n in names])}'
+
+
+def unmatched_files(words: Sequence[str], node: str) -> list[str]:
+    """Return a sentence for each parameter file of a command line that ROS does not apply.
+
+    ``node`` is the full name of the node. Files that cannot be read are left to ROS.
+    """
+    told = []
+    for option, name in pairwise(words):
+        if option != '--params-file':
+            continue
+        try:
+            content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
+        except (OSError, yaml.YAMLError, ValueError):
+            continue
+        if isinstance(content, dict) and (problem := unmatched(content, node)):
+            told.append(f'The parameter file {name} {problem}.')
+    return told
 
 
 def _flat(content: dict[Any, Any]) -> dict[str, Any]:

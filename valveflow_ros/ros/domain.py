@@ -12,6 +12,7 @@ load. It then continues with the participant that has discovered the most neighb
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 
@@ -237,6 +238,11 @@ class Presence:
         for _ in range(count):
             if not self._add_participant():
                 break
+
+    @property
+    def args(self) -> list[str]:
+        """Return the arguments for `rclpy.init`."""
+        return sys.argv[1:] if self._args is None else self._args
 
     def settle(self) -> Context:
         """Return the context that has discovered most neighbours; the others leave the domain.

@@ -10,7 +10,7 @@ import gc
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -29,6 +29,7 @@ from std_srvs.srv import Trigger
 from valveflow_msgs.srv import OperateAlarm
 
 from valveflow_ros.errors import DataError, ParameterError, ValveflowError, counted, listed
+from valveflow_ros.interface.settings import NODE, unmatched_files
 from valveflow_ros.logs import RecorderState, RecorderStatus
 from valveflow_ros.monitoring.alarm_state import AlarmAction
 from valveflow_ros.parameters import Settings
@@ -210,7 +211,7 @@ def _logged(transition: _Transition) -> _Transition:
 class MonitorNode(LifecycleNode):
     """The monitor as a managed node.
 
-    ``stop`` returns True if the process must end.
+    ``stop`` returns True if the process must end, ``args`` is the command line.
 
     Raises
     ------
@@ -222,9 +223,10 @@ class MonitorNode(LifecycleNode):
         self,
         stop: Callable[[], bool] = lambda: False,
         watchdog: Watchdog | None = None,
+        args: Sequence[str] = (),
         **options: Any,
     ) -> None:
-        super().__init__('valveflow_monitor', **options)
+        super().__init__(NODE, **options)
         self._stop = stop
         self._watchdog = watchdog or Watchdog({})
         self.session: Session | None = None
@@ -237,6 +239,7 @@ class MonitorNode(LifecycleNode):
             'publisher': [self.resolve_topic_name(f'~/{name}') for name in OUTPUTS],
             'subscription': declare.inputs(self, self.settings).values(),
         })  # fmt: skip
+        self._ignored += unmatched_files(args, self.get_fully_qualified_name())
         self.add_pre_set_parameters_callback(declare.in_type)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._apply)
@@ -385,10 +388,10 @@ class MonitorNode(LifecycleNode):
             self._log(level, f'{", ".join(names)}: {sentence}')
 
     def unknown_parameters(self) -> list[Item]:
-        """Return an item if a parameter was given that does not exist, else nothing."""
+        """Return an item if a given parameter or parameter file has no effect, else nothing."""
         if not self._ignored:
             return []
-        # Also reported as health, because the user expects the parameter to have an effect.
+        # Also reported as health, because the user expects an effect of them.
         ignored = 'It is ignored.' if len(self._ignored) == 1 else 'They are ignored.'
         sentence = f'{" ".join(self._ignored)} {ignored}'
         return [Item('parameters', Level.WARN, sentence, {'Ignored': len(self._ignored)})]
@@ -500,7 +503,7 @@ def run(stop: StopFlag, presence: Presence) -> int:
     if stop:
         return 0
     watchdog = Watchdog()
-    node = MonitorNode(lambda: bool(stop), watchdog, context=presence.settle())
+    node = MonitorNode(lambda: bool(stop), watchdog, presence.args, context=presence.settle())
     presence.end()
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
