@@ -65,11 +65,16 @@ def test_a_short_log_leaves_the_noise_to_the_monitor(run, slow_table, tmp_path):
 # The file, and what is said of it.
 BAD_FILES = [
     ('/**:\n  ros__parameters:\n    dellay: 3\n    block: fast\n    delay: 2.0\n',
-     ["'dellay' does not exist; did you mean 'delay'?", "'block' must be a number"]),
+     ["'dellay' does not exist; did you mean 'delay'? The monitor would ignore it.",
+      "'block' must be a number"]),
     ('/**:\n  ros__parameters:\n    block: 0.5\n', ['must not be below sample_period']),
     ('/**:\n  ros__parameters:\n    [\n', ['no YAML file']),
     ("/**:\n  ros__parameters:\n    covariates: 'backlash=/x'\n",
      ["Parameter 'covariates' cannot be used: entry 'backlash' is a"]),
+    ('/**:\n  ros__parameters:\n    model_file: /no/such/file\n',
+     ["'model_file' names '/no/such/file', which cannot be used: no such file"]),
+    ('/**:\n  ros__parameters:\n    reference_file: curve.json\n',
+     ["'reference_file' names 'curve.json', which cannot be used: ", 'characteristic']),
     ('delay: 3.0\n', ['Put the lines']),
     ('valveflow_monitor:\n  delay: 3.0\n', ['Put the lines']),
     ('/**:\n  ros__parameters: 3\n', ['Put the lines']),
@@ -80,8 +85,10 @@ BAD_FILES = [
 ]  # fmt: skip
 
 
-def test_what_the_monitor_would_refuse_is_named(run, tmp_path):
+def test_what_the_monitor_would_refuse_is_named(run, tmp_path, monkeypatch):
     file = tmp_path / 'x.yaml'
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'curve.json').write_text('{"format": "another"}')
     for text, parts in BAD_FILES:
         file.write_text(text)
         sentence = run('config', 'check', file).refused()

@@ -34,8 +34,8 @@ from valveflow_ros.diagnosis.extended import ExtendedModel
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.errors import DataError, ParameterError, RecordingError
 from valveflow_ros.interface.models import load_characteristic, load_extended, load_truth
+from valveflow_ros.interface.parameter_files import given_model, given_reference
 from valveflow_ros.parameters import Settings
-from valveflow_ros.ros.node.parameter_files import given_model, given_reference
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 

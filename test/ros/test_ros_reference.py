@@ -22,6 +22,7 @@ from valveflow_ros.cli.main import main
 from valveflow_ros.curve.characteristic_json import to_json
 from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
+from valveflow_ros.interface import parameter_files
 from valveflow_ros.logs import open_log
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.monitoring.offline import feed_rows
@@ -31,7 +32,6 @@ from valveflow_ros.records import NS_PER_S, SIGNALS, SampleTable, Signal
 from valveflow_ros.ros import monitor_main
 from valveflow_ros.ros import verify as verifying
 from valveflow_ros.ros.encoding import to_time
-from valveflow_ros.ros.node import parameter_files
 
 HELD = {'backlash': {'w_percent': 0.5}, 'gain_drift': {'g': 0.05}, 'clock': {'d_s': 3.0}}
 STATE = {Signal.VALVE_OPENING: 50.0, Signal.MAIN_STEAM_PRESSURE: 13.0,

@@ -16,12 +16,12 @@ from rclpy.parameter import Parameter as RosParameter
 from ros_helpers import LOOPBACK, PATIENCE_S, rtps_ports
 
 from valveflow_ros.errors import ParameterError, RecordingError
+from valveflow_ros.interface.parameter_files import given_reference
 from valveflow_ros.logs import Recorder, RecorderSettings
 from valveflow_ros.parameters import TABLE, Settings
 from valveflow_ros.ros import domain, monitor_main, replay_main, simulator_main
 from valveflow_ros.ros.domain import InsecureError, check_security
 from valveflow_ros.ros.node.monitor_node import MonitorNode
-from valveflow_ros.ros.node.parameter_files import given_reference
 from valveflow_ros.ros.node.recording import Recording, new_folder
 
 pytestmark = pytest.mark.ros

@@ -174,7 +174,8 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
         try:
             given[name] = parameter(name).check(value)
         except ParameterError as error:
-            wrong.append(str(error))
+            ignored = of_node and name not in PARAMETERS
+            wrong.append(f'{error} The monitor would ignore it.' if ignored else str(error))
     if wrong:
         raise InputError(f'{file}: {" ".join(wrong)}')
     return given

@@ -18,6 +18,7 @@ from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.diagnosis import result
 from valveflow_ros.errors import DataError, RecordingError, ValveflowError, counted
 from valveflow_ros.fit.task import FitTask
+from valveflow_ros.interface import parameter_files
 from valveflow_ros.logs import LogContents, LoggedMessage, open_log
 from valveflow_ros.logs.names import TOPICS
 from valveflow_ros.monitoring.events import DiagnosisContent, DiagnosisTask, JournalKind
@@ -27,7 +28,6 @@ from valveflow_ros.monitoring.rows import Corrector
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import Readings
 from valveflow_ros.ros.decoding import Decoder, from_time, journal_entry
-from valveflow_ros.ros.node import parameter_files
 from valveflow_ros.ros.node.outputs import OUTPUTS, Output, Outputs
 from valveflow_ros.ros.node.recording import PARAMETERS
 from valveflow_ros.ros.node.worker import DiagnosisWorker, FitWorker, Task, Worker

@@ -76,6 +76,7 @@ def run(options: Namespace, console: Console) -> VerbResult:
 
 def _checked(file: Path) -> VerbResult:
     """Read a parameter file as the monitor would, and return its changes."""
+    from valveflow_ros.interface.parameter_files import given_model, given_reference
     from valveflow_ros.interface.settings import check_names, read_parameters
     from valveflow_ros.parameters import PARAMETERS, Settings
 
@@ -83,6 +84,8 @@ def _checked(file: Path) -> VerbResult:
     try:
         settings = Settings(given)
         check_names(settings)
+        given_model(settings)
+        given_reference(settings)
     except ParameterError as error:
         raise InputError(f'{file}: {error}') from None
     changed = {

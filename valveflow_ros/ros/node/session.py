@@ -17,13 +17,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
+from valveflow_ros.interface import parameter_files
 from valveflow_ros.logs import Qos, RecorderStatus
 from valveflow_ros.monitoring.events import CurveAdopted, Event
 from valveflow_ros.parameters import Settings
 from valveflow_ros.report.words import in_zone
 from valveflow_ros.ros import declare
 from valveflow_ros.ros.decoding import PLANT_SAMPLE, Decoder, inputs_of, sample_warnings
-from valveflow_ros.ros.node import health, parameter_files
+from valveflow_ros.ros.node import health
 from valveflow_ros.ros.node.diagnostics import Item, Level, line_of
 from valveflow_ros.ros.node.engine import LiveEngine, warm_up
 from valveflow_ros.ros.node.intake import Intake, LogClock
