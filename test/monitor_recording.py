@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -113,14 +114,18 @@ def diagnosis(time_ns: int, verdict: int, sentence: str, *causes: str) -> bytes:
 class Monitor:
     """Writes what a monitor would, second by second."""
 
-    def __init__(self, folder: Path) -> None:
-        self.writer = RecordingWriter(folder, definitions=STOCK)
+    def __init__(
+        self, folder: Path, renamed: Mapping[str, str] | None = None, **attached: bytes
+    ) -> None:
+        """`renamed` gives the topic of an input that was remapped, by its usual topic."""
+        self._renamed = renamed or {}
+        self.writer = RecordingWriter(folder, definitions=STOCK, attachments=attached)
         for topic, kind in TYPES.items():
-            self.writer.add_topic(topic, kind)
+            self.writer.add_topic(self._renamed.get(topic, topic), kind)
         self.now_ns = START_NS
 
     def say(self, name: str, data: bytes) -> None:
-        topic = name if name.startswith('/') else f'{NODE}/{name}'
+        topic = self._renamed.get(name, name) if name.startswith('/') else f'{NODE}/{name}'
         self.writer.write(topic, data, self.now_ns, self.now_ns)
 
     def seconds(self, count: int, residual: float = 0.5) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from monitor_recording import START_NS, Monitor, alarm, cdr, recording
@@ -72,6 +73,22 @@ def test_an_input_that_stops_is_silent_and_one_that_cannot_be_is_rejected(tmp_pa
     assert found['generated_power'].sentence == (
         'the recording has ended; no value in its last 30 s.'
     )
+
+
+def test_inputs_that_were_remapped_are_found(tmp_path):
+    # One of them has the usual name of another.
+    theirs = {
+        '/valve_opening': '/gw/HV101', '/main_steam_pressure': '/gw/PT101',
+        '/generated_power': '/gw/main_steam_pressure',
+    }  # fmt: skip
+    told = {name[1:]: topic for name, topic in theirs.items()}
+    told |= {'valve_command': '/gw/never_came', 'vacuum': '/gw/vacuum'}
+    topics = {'topics.json': json.dumps({'inputs': told}).encode()}
+    monitor = Monitor(tmp_path / 'r', theirs, **topics)
+    monitor.seconds(5)
+    monitor.writer.close()
+    usual = frame_of(recording(tmp_path / 'usual', 5)).inputs
+    assert frame_of(tmp_path / 'r').inputs == usual
 
 
 def test_a_clock_that_goes_back_begins_the_residuals_anew(tmp_path):

@@ -18,6 +18,7 @@ from valveflow_ros.interface.files import reason
 from valveflow_ros.interface.plausibility import limits
 from valveflow_ros.logs.mcap.follow import Batch, Follower, Picker, Raw
 from valveflow_ros.logs.mcap.gather import Rows
+from valveflow_ros.logs.names import PLANT_SAMPLE, told_inputs
 from valveflow_ros.parameters import Settings
 from valveflow_ros.records import NS_PER_S, SIGNALS, Quality, Signal
 from valveflow_ros.report.terminal.board import (
@@ -42,7 +43,6 @@ _TOLD_S = 60.0
 class _Track:
     """State of one signal."""
 
-    topic: str
     last_ns: int = 0
     value: float = float('nan')
     step_s: float = 1.0
@@ -70,12 +70,12 @@ class InputWatch:
         named = {info.signal: given.get(f'{info.topic}_unit') for info in SIGNALS}
         self._units = {s: str(unit) for s, unit in named.items() if unit in known_units(s)}
 
-    def take(self, signal: Signal, topic: str, rows: Rows) -> None:
-        """Add readings of a signal, in their order."""
+    def take(self, signal: Signal, type_name: str, rows: Rows) -> None:
+        """Add readings of a signal from messages of this type, in their order."""
         if not len(rows.value):
             return
-        track = self._tracks.setdefault(signal, _Track(topic))
-        stamped = topic.endswith('plant_sample')
+        track = self._tracks.setdefault(signal, _Track())
+        stamped = type_name == PLANT_SAMPLE
         unit = SIGNALS[signal].unit if stamped else self._units.get(signal, SIGNALS[signal].unit)
         values = convert(signal, unit, rows.value)
         low, high = limits(signal, self._settings)
@@ -200,8 +200,9 @@ class LogWatch:
                 self._predictions.append(raw)
             else:
                 self._tell(raw)
-        for signal, topic, rows in self._picker.readings(batch):
-            self._inputs.take(signal, topic, rows)
+        told = told_inputs(self._follower.attachments)
+        for signal, type_name, rows in self._picker.readings(batch, told):
+            self._inputs.take(signal, type_name, rows)
             if not self._heard and len(rows.time_ns):
                 self._board.at(int(rows.time_ns[-1]))
         if len(batch.messages):

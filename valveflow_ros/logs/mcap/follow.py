@@ -9,7 +9,7 @@ so a recording may grow for months.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -346,16 +346,24 @@ class Picker:
             self.misfits += 1
             return None
 
-    def readings(self, batch: Batch) -> Iterator[tuple[Signal, str, Rows]]:
-        """Yield signal, topic and rows (in file order) of the inputs."""
-        messages = batch.messages
+    def readings(
+        self, batch: Batch, told: Mapping[str, str] | None = None
+    ) -> Iterator[tuple[Signal, str, Rows]]:
+        """Yield signal, type of the message and rows (in file order) of the inputs.
+
+        ``told`` is the topic of each input that the recording names; see `told_inputs`.
+        """
+        messages, told = batch.messages, told or {}
+        names = {topic: name for name, topic in told.items()}
         for channel, type_name, definition in _channels(batch):
             topic = batch.topics.channels[channel].topic
             mine = np.flatnonzero(messages.channel == channel)
-            if type_name == FLOAT64 and last_part(topic) in _INPUTS:
+            name = names.get(topic, last_part(topic))
+            # Another topic is not an input, even if the last part of its name is that of one.
+            if type_name == FLOAT64 and name in _INPUTS and told.get(name, topic) == topic:
                 (_, found), wrong = float_rows(batch.content, messages, mine)
                 self.misfits += len(wrong)
-                yield signal_of(last_part(topic)), topic, found
+                yield signal_of(name), type_name, found
             elif type_name == PLANT_SAMPLE:
                 reader: PlantSampleReader | None = self._made(PlantSampleReader, definition)
                 if reader is None:
@@ -365,7 +373,7 @@ class Picker:
                 _, found = sample_rows(messages, mine, samples)
                 for number in np.unique(found.signal).tolist():
                     keep = found.signal == number
-                    yield Signal(number), topic, Rows(*(column[keep] for column in found))
+                    yield Signal(number), type_name, Rows(*(column[keep] for column in found))
 
     def _made(self, make: Callable[..., Any], *key: str) -> Any:
         """Return the cached decoder of a definition; None if it cannot be parsed."""
