@@ -101,6 +101,11 @@ AT_ODDS = (
 def test_values_at_odds_are_refused_by_the_name_of_one_of_them():
     for values, name in AT_ODDS:
         assert f"'{name}'" in refusal(values)
+    # All that a longer step needs at once.
+    assert refusal({'sample_period': 60.0}) == (
+        "Parameter 'hold_limit' (10 s) and block (10 s) must not be below sample_period (60 s)."
+    )
+    Settings({'sample_period': 60.0, 'hold_limit': 150.0, 'block': 60.0})
 
 
 def value_of(row):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import tzinfo
 from typing import Any
 
-from valveflow_ros.errors import InputError, ParameterError, UsageError
+from valveflow_ros.errors import InputError, ParameterError, UsageError, listed
 from valveflow_ros.records import FLOW_UNITS, zone_of
 
 Value = bool | int | float | str
@@ -575,11 +575,11 @@ def _check_together(values: Mapping[str, Value]) -> None:
                 f'{signal}_low', f'({low:g}) must be below {signal}_high ({high:g})'
             )
     period = float(values['sample_period'])
-    for name in ('hold_limit', 'block', 'alarm_block', 'alarm_average'):
-        if float(values[name]) < period:
-            raise ParameterError(
-                name, f'({float(values[name]):g} s) must not be below sample_period ({period:g} s)'
-            )
+    names = ('hold_limit', 'block', 'alarm_block', 'alarm_average')
+    if short := [name for name in names if float(values[name]) < period]:
+        first, *others = (f'{name} ({float(values[name]):g} s)' for name in short)
+        told = listed([first.removeprefix(f'{short[0]} '), *others])
+        raise ParameterError(short[0], f'{told} must not be below sample_period ({period:g} s)')
     if values['selection_rule'] == 'prediction_error' and not values['refine']:
         raise ParameterError('selection_rule', 'must be paper when refine is false')
     longest, window_s = float(values['longest_segment']), 86400.0 * float(values['window_days'])
