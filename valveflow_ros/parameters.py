@@ -527,19 +527,22 @@ def parameter(name: str) -> Parameter:
     return row
 
 
-def covariate_columns(said: Iterable[str], where: str = '--covariate') -> dict[str, str]:
+def covariate_columns(
+    said: Iterable[str], where: str = '--covariate', column: str = 'COLUMN'
+) -> dict[str, str]:
     """Return ``COLUMN`` or ``COLUMN:UNIT`` of texts ``NAME=COLUMN[:UNIT]``, by name.
 
     Raises
     ------
     UsageError
-        A text has another form, or a name is given twice. The message begins with ``where``.
+        A text has another form, or a name is given twice. The message begins with ``where`` and
+        calls the column ``column``.
     """
     found: dict[str, str] = {}
     for text in said:
         name, equals, theirs = (part.strip() for part in text.partition('='))
         if not equals or not name or not theirs:
-            raise UsageError(f"{where} '{text}' is not of the form NAME=COLUMN[:UNIT].")
+            raise UsageError(f"{where} '{text}' is not of the form NAME={column}[:UNIT].")
         if name in found:
             raise UsageError(f'{where} {name} is given twice.')
         found[name] = theirs
@@ -548,7 +551,7 @@ def covariate_columns(said: Iterable[str], where: str = '--covariate') -> dict[s
 
 def _check_covariates(text: str) -> None:
     try:
-        count = len(covariate_columns(text.split(), 'entry'))
+        count = len(covariate_columns(text.split(), 'entry', 'TOPIC'))
     except UsageError as error:
         raise ParameterError('covariates', f'cannot be used: {str(error).rstrip(".")}') from None
     if count > _MOST_COVARIATES:

@@ -124,6 +124,7 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(processes, lis
 def test_a_bad_entry_is_refused_in_the_words_of_the_option(context):
     node = MonitorNode(context=context)
     for text, sentence in (
+        ('vacuum', "entry 'vacuum' is not of the form NAME=TOPIC[:UNIT]."),
         ('a-b=/x', "entry 'a-b': a name has letters, digits and underscores, at most 40."),
         ('backlash=/x', "entry 'backlash' is a cause of the catalogue already; choose another"),
         ('a=/x//y', "entry '/x//y' is no name of a topic."),
