@@ -142,6 +142,10 @@ REFUSED = [
     ('monitor', '--ros-args --params-file negative', "Parameter 'refit_period' must be", 1),
     ('monitor', '--ros-args --params-file number', "Parameter 'unit_tag' must be a text, not 7; "
      "write unit_tag: '7' in a file, -p unit_tag:=\"'7'\" on a command line.", 1),
+    ('monitor', '--unit U8', "'--unit' must follow --ros-args, as in: ros2 run", 2),
+    ('monitor', '-p unit_tag:=U8', "'-p' must follow --ros-args", 2),
+    ('plant_simulator', '--ros-args -p seed:=1 -- --days 1', "'--days' must follow --ros-args", 2),
+    ('opcua_gateway', 'opcua.yaml', "'opcua.yaml' must follow --ros-args", 2),
     ('monitor', '--ros-args --params-file broken', 'ROS could not be started', 1),
 ]  # fmt: skip
 PARAMETERS = {

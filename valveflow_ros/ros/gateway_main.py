@@ -47,7 +47,7 @@ from valveflow_ros.ros.node.diagnostics import (
     diagnostics_message,
     log_at,
 )
-from valveflow_ros.ros.process import StopFlag, show, usage, wants_help
+from valveflow_ros.ros.process import StopFlag, answered, usage
 
 NAME = 'opcua_gateway'
 TABLE: tuple[Parameter, ...] = (
@@ -315,9 +315,9 @@ _EXAMPLE = 'ros2 run valveflow_ros opcua_gateway --ros-args -p mapping_file:=opc
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the gateway until it is asked to stop; return the exit status."""
-    if wants_help(args):
-        show(usage(_ABOUT, _EXAMPLE, TABLE))
-        return 0
+    page = partial(usage, _ABOUT, _EXAMPLE, TABLE)
+    if (status := answered(NAME, args, page, _EXAMPLE)) is not None:
+        return status
     stop = StopFlag().install()
     return run(NAME, args, lambda: _run(stop))
 

@@ -8,6 +8,7 @@ which the other participants in the domain discover this process.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import sys
@@ -19,10 +20,9 @@ from valveflow_ros.parameters import TABLE
 from valveflow_ros.ros.process import (
     StopFlag,
     Stopped,
+    answered,
     complain,
-    show,
     usage,
-    wants_help,
     with_place,
 )
 
@@ -38,9 +38,9 @@ _EXAMPLE = (
 def main(args: Sequence[str] | None = None) -> int:
     """Run the monitor until it is asked to stop; return the exit status."""
     stop = StopFlag().install()
-    if wants_help(args):
-        show(usage(_ABOUT, _EXAMPLE, TABLE))
-        return 0
+    page = functools.partial(usage, _ABOUT, _EXAMPLE, TABLE)
+    if (status := answered('monitor', args, page, _EXAMPLE)) is not None:
+        return status
     # Recordings, logs and compiled code are private, independent of the shell's umask.
     before = os.umask(0o077)
     presence: Any = None

@@ -11,7 +11,7 @@ import re
 import signal
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -104,10 +104,25 @@ def complain(executable: str, sentence: str) -> int:
     return 1
 
 
-def wants_help(args: Sequence[str] | None) -> bool:
-    """Return True if the arguments request help."""
+def answered(
+    executable: str, args: Sequence[str] | None, page: Callable[[], str], example: str
+) -> int | None:
+    """Print the help if the arguments request it; refuse what is outside ``--ros-args``.
+
+    Returns the exit status, or None if the node can start.
+    """
     given = sys.argv[1:] if args is None else args
-    return any(word in ('-h', '--help') for word in given)
+    if any(word in ('-h', '--help') for word in given):
+        show(page())
+        return 0
+    of_ros = False
+    for word in given:
+        if word == '--ros-args' or (of_ros and word == '--'):
+            of_ros = word == '--ros-args'
+        elif not of_ros:
+            complain(executable, f"'{word}' must follow --ros-args, as in: {example}")
+            return 2
+    return None
 
 
 def show(text: str) -> None:

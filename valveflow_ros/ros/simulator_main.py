@@ -24,7 +24,7 @@ from valveflow_ros.ros.decoding import PLANT_SAMPLE
 from valveflow_ros.ros.domain import run
 from valveflow_ros.ros.encoding import encode, float64_bytes, header
 from valveflow_ros.ros.player import Player, Step
-from valveflow_ros.ros.process import StopFlag, show, usage, wants_help
+from valveflow_ros.ros.process import StopFlag, answered, usage
 
 TABLE: tuple[Parameter, ...] = (
     Parameter('days', 10.0, 'd', 'How long the plant is simulated.', 0.001, 400.0),
@@ -127,12 +127,15 @@ _EXAMPLE = (
 
 def main(args: Sequence[str] | None = None) -> int:
     """Simulate and publish; return the exit status."""
-    if wants_help(args):
-        show(usage(_ABOUT, _EXAMPLE, TABLE))
-        show(f'  {"effects":28} []\n  {"":28} {_EFFECTS.description}')
-        return 0
+    if (status := answered('plant_simulator', args, _help, _EXAMPLE)) is not None:
+        return status
     stop = StopFlag().install()
     return run('plant_simulator', args, lambda: _run(stop))
+
+
+def _help() -> str:
+    rows = usage(_ABOUT, _EXAMPLE, TABLE)
+    return f'{rows}\n  {"effects":28} []\n  {"":28} {_EFFECTS.description}'
 
 
 def _run(stop: StopFlag) -> int:
