@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """``valveflow config``: a file that the monitor takes, and what is wrong with one."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from monitor_recording import Monitor
 
 from valveflow_ros.interface.settings import read_parameters
 from valveflow_ros.parameters import PARAMETERS, Settings
@@ -112,6 +115,21 @@ def test_a_namespace_and_a_node_without_parameters_are_taken(run, tmp_path, text
     file = tmp_path / 'x.yaml'
     file.write_text(text)
     assert 'the monitor takes it' in run('config', 'check', file).out
+
+
+def test_the_tag_of_a_recording_is_kept(run, tmp_path):
+    attached = {'parameters.json': json.dumps({'unit_tag': 'U7'}).encode()}
+    monitor = Monitor(tmp_path / 'r', **attached)
+    monitor.seconds(60)
+    monitor.writer.close()
+    for words, tag in (((), 'U7'), (('--unit-tag', 'U8'), 'U8')):
+        ran = run('config', 'init', tmp_path / 'r', *words).done()
+        assert yaml.safe_load(ran.out)['/**']['ros__parameters']['unit_tag'] == tag
+
+
+def test_another_task_is_refused_with_those_there_are(run, tmp_path):
+    sentence = run('config', 'make', tmp_path / 'x.yaml').refused(2)
+    assert "config can init (make a parameter file) or check (one), not 'make'" in sentence
 
 
 def test_a_column_s_name_cannot_write_parameters(run, tmp_path):

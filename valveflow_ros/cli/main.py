@@ -54,7 +54,7 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('compensate', 'compensate', 'write the inverse curve as a table for the turbine controller'),
     ('export', 'export', 'write a log as a table'),
     ('recover', 'recover', 'repair a broken recording'),
-    ('config', 'config', 'make or check a parameter file for the monitor'),
+    ('config', 'config', 'make (init) or check a parameter file for the monitor'),
     ('watch', 'watch', 'show a running monitor in the terminal or on a page'),
     ('completion', 'completion', 'complete commands in the shell'),
 )

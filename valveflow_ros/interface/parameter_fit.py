@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from typing import Any
 
 from valveflow_ros import __version__
 from valveflow_ros.curve.characteristic import Characteristic
-from valveflow_ros.errors import DataError
+from valveflow_ros.errors import DataError, ParameterError
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.interface import SILENT, Progress
 from valveflow_ros.interface.logs import Log, as_log
@@ -77,6 +78,8 @@ def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT)
     found = Fitted()
     if unit_tag:
         found.put('unit_tag', unit_tag, 'as you said')
+    elif recorded := _recorded_tag(log):
+        found.put('unit_tag', recorded, 'the monitor that made the recording had this tag')
     _units(log, found)
     _steps(log, found)
     changes = found.changes()
@@ -90,6 +93,16 @@ def fit_parameters(log: Any, unit_tag: str = '', *, progress: Progress = SILENT)
     _noise(monitor, found)
     _dynamics(monitor, found, progress)
     return found
+
+
+def _recorded_tag(log: Log) -> str:
+    """Return the tag in the parameters of a recording; empty if it has none or the default."""
+    try:
+        tag = json.loads(log.contents.attachments['parameters.json'])['unit_tag']
+        tag = str(PARAMETERS['unit_tag'].check(tag))
+    except (KeyError, ValueError, TypeError, ParameterError):
+        return ''
+    return '' if tag == PARAMETERS['unit_tag'].default else tag
 
 
 def _units(log: Log, found: Fitted) -> None:

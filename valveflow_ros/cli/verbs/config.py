@@ -32,11 +32,17 @@ example:
 
 def arguments(parser: ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument('task', metavar='init|check', help='make a parameter file, or check one')
+    parser.add_argument(
+        'task', metavar='init|check', help='make a parameter file (init), or check one'
+    )
     parser.add_argument('place', metavar='LOG|FILE', type=Path, help='the log, or the file')
     told = 'where to write the parameters (default: on the screen)'
     add_output(parser, 'FILE', told, required=False)
-    parser.add_argument('--unit-tag', metavar='TAG', help='tag of the unit, such as U3')
+    parser.add_argument(
+        '--unit-tag',
+        metavar='TAG',
+        help='tag of the unit, such as U3 (default: that of the recording)',
+    )
     parser.add_argument('--overwrite', action='store_true', help='replace a file that is there')
     add_mapping(parser)
 
@@ -47,7 +53,8 @@ def run(options: Namespace, console: Console) -> VerbResult:
     if options.task == 'check':
         return _checked(options.place)
     if options.task != 'init':
-        raise UsageError(f"config can init or check, not '{options.task}'.")
+        told = 'config can init (make a parameter file) or check (one)'
+        raise UsageError(f"{told}, not '{options.task}'.")
     from valveflow_ros.interface.files import check_output, whole_file
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.interface.parameter_fit import fit_parameters, parameter_file
