@@ -72,6 +72,13 @@ def test_an_unknown_name_is_refused_and_the_nearest_one_suggested():
         assert ('does not exist' in sentence, 'did you mean' in sentence) == (True, False)
 
 
+def test_a_topic_is_no_parameter():
+    for name in ('valve_opening', 'plant_sample'):
+        sentence = refusal({name: '/plc/x'})
+        assert f"'{name}' does not exist: it is a topic; remap it with -r {name}:=" in sentence
+        assert 'did you mean' not in sentence
+
+
 def test_a_zone_that_is_none_is_refused_and_one_suggested():
     assert 'Europe/Berlin' in refusal({'time_zone': 'Nowhere'})
     assert Settings({'time_zone': 'UTC'}).zone is Settings().zone is None

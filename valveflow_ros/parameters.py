@@ -19,7 +19,7 @@ from datetime import tzinfo
 from typing import Any
 
 from valveflow_ros.errors import InputError, ParameterError, UsageError, listed
-from valveflow_ros.records import FLOW_UNITS, zone_of
+from valveflow_ros.records import FLOW_UNITS, SIGNALS, zone_of
 
 Value = bool | int | float | str
 
@@ -406,6 +406,7 @@ TABLE: tuple[Parameter, ...] = (
     *_RECORD,
 )
 PARAMETERS: dict[str, Parameter] = {row.name: row for row in TABLE}
+_TOPICS = ('plant_sample', *(info.topic for info in SIGNALS))
 
 
 class Settings(Mapping[str, Value]):
@@ -517,9 +518,18 @@ class Settings(Mapping[str, Value]):
         return 5.0 * self.real('time_constant') + self.real('delay')
 
 
-def parameter(name: str) -> Parameter:
-    """Return the parameter ``name``; the error message names the most similar one."""
+def parameter(name: str, value: object = None) -> Parameter:
+    """Return the parameter ``name``; the error message names the most similar one.
+
+    ``value`` is what was given for it, for the message on a topic that is no parameter.
+    """
     row = PARAMETERS.get(name)
+    if row is None and name in _TOPICS:
+        theirs = value if isinstance(value, str) and value else 'TOPIC'
+        raise ParameterError(
+            name,
+            f'does not exist: it is a topic; remap it with -r {name}:={theirs} after --ros-args',
+        )
     if row is None:
         near = difflib.get_close_matches(str(name), PARAMETERS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ''

@@ -68,8 +68,10 @@ def test_a_short_log_leaves_the_noise_to_the_monitor(run, slow_table, tmp_path):
 # The file, and what is said of it.
 BAD_FILES = [
     ('/**:\n  ros__parameters:\n    dellay: 3\n    block: fast\n    delay: 2.0\n',
-     ["'dellay' does not exist; did you mean 'delay'? The monitor would ignore it.",
-      "'block' must be a number"]),
+     [":\n  Parameter 'dellay' does not exist; did you mean 'delay'? The monitor would ignore it.",
+      "\n  Parameter 'block' must be a number"]),
+    ("/**:\n  ros__parameters:\n    valve_opening: '/plc/x'\n",
+     ["'valve_opening' does not exist: it is a topic; remap it with -r valve_opening:=/plc/x"]),
     ('/**:\n  ros__parameters:\n    block: 0.5\n', ['must not be below sample_period']),
     ('/**:\n  ros__parameters:\n    [\n', ['no YAML file']),
     ("/**:\n  ros__parameters:\n    covariates: 'backlash=/x'\n",

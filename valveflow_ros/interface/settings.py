@@ -172,12 +172,12 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
     given, wrong = {}, []
     for name, value in _flat(content).items():
         try:
-            given[name] = parameter(name).check(value)
+            given[name] = parameter(name, value).check(value)
         except ParameterError as error:
             ignored = of_node and name not in PARAMETERS
             wrong.append(f'{error} The monitor would ignore it.' if ignored else str(error))
     if wrong:
-        raise InputError(f'{file}: {" ".join(wrong)}')
+        raise InputError('\n  '.join([f'{file}:', *wrong]) if wrong[1:] else f'{file}: {wrong[0]}')
     return given
 
 

@@ -112,14 +112,14 @@ def _checked(row: Parameter, value: object) -> Value:
 
 def unknown_overrides(node: Node, known: Iterable[str] = PARAMETERS) -> list[str]:
     """Return a sentence for each given parameter that does not exist."""
-    given: Mapping[str, object] = getattr(node, '_parameter_overrides', {})
+    given: Mapping[str, RosParameter] = getattr(node, '_parameter_overrides', {})
     names = set(known) | set(_FOREIGN)
     sentences = []
-    for name in given:
+    for name, item in given.items():
         if name in names or name.startswith(_FOREIGN_PREFIX):
             continue
         try:
-            parameter(name)
+            parameter(name, item.value)
         except ParameterError as error:
             sentences.append(str(error))
     return sentences
