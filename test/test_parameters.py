@@ -72,6 +72,18 @@ def test_an_unknown_name_is_refused_and_the_nearest_one_suggested():
         assert ('does not exist' in sentence, 'did you mean' in sentence) == (True, False)
 
 
+def test_a_choice_in_another_case_or_with_a_slip_is_suggested():
+    for name, wrong, right in (
+        ('main_steam_pressure_unit', 'Bar', 'bar'), ('main_steam_pressure_unit', 'mpa', 'MPa'),
+        ('main_steam_pressure_unit', 'PSIG', 'psig'), ('main_steam_pressure_unit', 'hPa', ''),
+        ('main_steam_pressure_unit', 'bara', 'bar'), ('main_steam_temperature_unit', 'C', ''),
+        ('input_reliability', 'best-effort', 'best_effort'), ('axis', 'Opening', 'opening'),
+    ):  # fmt: skip
+        sentence = refusal({name: wrong})
+        end = f"not '{wrong}'; did you mean '{right}'?" if right else f"not '{wrong}'."
+        assert sentence.endswith(end)
+
+
 def test_a_topic_is_no_parameter():
     for name in ('valve_opening', 'plant_sample'):
         sentence = refusal({name: '/plc/x'})

@@ -110,9 +110,17 @@ class Parameter:
         if not value.isprintable() or len(value) > 500:
             raise ParameterError(self.name, 'must be one line of at most 500 printable characters')
         if self.choices and value not in self.choices:
-            allowed = ', '.join(self.choices)
-            raise ParameterError(self.name, f"must be one of {allowed}, not '{value}'")
+            allowed, near = ', '.join(self.choices), self._nearest(value)
+            hint = f"; did you mean '{near}'?" if near else ''
+            raise ParameterError(self.name, f"must be one of {allowed}, not '{value}'{hint}")
         return value
+
+    def _nearest(self, value: str) -> str:
+        """Return the choice that differs only by case or little from a text; empty if none."""
+        by_word = {choice.casefold(): choice for choice in self.choices}
+        # The limit is high, because similar units differ by a factor: Pa and hPa.
+        near = difflib.get_close_matches(value.strip().casefold(), by_word, n=1, cutoff=0.85)
+        return by_word[near[0]] if near else ''
 
     def _check_number(self, value: object) -> int | float:
         whole = isinstance(self.default, int)
