@@ -107,18 +107,24 @@ def test_help_that_nobody_reads_to_its_end_is_no_accident():
     assert (ended.returncode, ended.stderr) == (0, '')
 
 
-def test_what_is_no_number_is_refused_in_words(capsys):
+def test_a_wrong_argument_is_refused_in_a_sentence(capsys):
     for parser, words, said in (
         (replay_main.parser, 'x.mcap --rate fast', '--rate must be a number of seconds of the'),
         (replay_main.parser, 'x.mcap --wait nan', "such as --wait 60; 'nan' is not"),
         (watch_main.parser, '--interval 0', "from 0.1 to 3600, such as --interval 5; '0' is"),
+        (watch_main.parser, '--ask foo', 'valveflow watch: --ask must be one of refit, '),
+        (watch_main.parser, '--ask', 'valveflow watch: --ask wants a value after it. Try --help.'),
+        (replay_main.parser, 'x.mcap y.mcap', "replay: 'y.mcap' is one argument too many."),
+        (replay_main.parser, '', 'valveflow replay: Something is missing: LOG.'),
         (demo.parser, '--output d --days -1', '--days must be a number of days'),
         (demo.parser, '--output d --seed x', "'x' is no whole number"),
     ):
         with pytest.raises(SystemExit) as ended:
             parser().parse_args(words.split())
         assert ended.value.code == 2
-        assert said in capsys.readouterr().err
+        told = capsys.readouterr().err
+        assert said in told
+        assert told.count('\n') == 1
 
 
 NOT_A_FILE = 'cannot be opened (no such file or directory)'

@@ -8,7 +8,6 @@ import difflib
 import gc
 import importlib
 import os
-import re
 import signal
 import sys
 import time
@@ -26,9 +25,9 @@ from valveflow_ros.errors import (
     UsageError,
     ValveflowError,
     check_address_space,
-    listed,
 )
 from valveflow_ros.interface.files import check_folder, check_readable, check_writable
+from valveflow_ros.report.terminal.text import usage_sentence
 
 DONE, NOT_DONE, WRONG_USAGE = 0, 1, 2
 # Exit status of a process ended by a signal, as in a shell: 130 after Ctrl-C.
@@ -128,28 +127,10 @@ class Parser(ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise the error of argparse as a sentence."""
-        missing = message.removeprefix('the following arguments are required: ')
-        if missing != message:
-            raise UsageError(f'Something is missing: {listed(missing.split(", "))}.')
-        words = message.removeprefix('unrecognized arguments: ')
-        if words != message:
-            output = ' Write an output as -o OUTPUT.' * ('-o' in self._option_string_actions)
-            raise UsageError(f"'{words}' is one argument too many.{output}")
-        raise UsageError(f'{_sentence(message).removesuffix(".")}.')
-
-
-def _sentence(message: str) -> str:
-    """Rewrite a message of argparse: the option first, then its error."""
-    about = re.fullmatch(r'argument (\S+): (.*)', message, re.DOTALL)
-    if about is None:
-        return message[:1].upper() + message[1:]
-    name, problem = about[1].rpartition('/')[2], about[2]
-    if problem.startswith('expected one argument'):
-        return f'{name} wants a value after it'
-    choice = re.fullmatch(r'invalid choice: (.*) \(choose from (.*)\)', problem)
-    if choice is not None:
-        return f'{name} must be one of {choice[2].replace(chr(39), "")}, not {choice[1]}'
-    return f'{name} {problem}' if problem.startswith('must ') else f'{name}: {problem}'
+        output = ''
+        if message.startswith('unrecognized') and '-o' in self._option_string_actions:
+            output = ' Write an output as -o OUTPUT.'
+        raise UsageError(f'{usage_sentence(message)}{output}')
 
 
 class _Formatter(RawDescriptionHelpFormatter):

@@ -20,6 +20,7 @@ from typing import NamedTuple, NoReturn
 
 from valveflow_ros.errors import InputError, RecordingError
 from valveflow_ros.parameters import Parameter
+from valveflow_ros.report.terminal.text import usage_sentence
 
 _ASKED_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -135,15 +136,16 @@ def show(text: str) -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose help output may be cut off by the reader of a pipe."""
+    """A parser whose errors are sentences, and whose help may be cut off by the reader."""
 
     def print_help(self, file: object = None) -> None:
         """Print the help on stdout."""
         show(self.format_help().rstrip('\n'))
 
     def error(self, message: str) -> NoReturn:
-        """Report a usage error and exit."""
-        super().error(re.sub(r'^argument (\S+): must ', r'\1 must ', message))
+        """Report a usage error in a sentence and exit."""
+        complain(self.prog.rpartition('.')[2], f'{usage_sentence(message)} Try --help.')
+        sys.exit(2)
 
 
 def parameter_file(values: Mapping[str, object]) -> str:

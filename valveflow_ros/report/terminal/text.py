@@ -11,6 +11,8 @@ from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
+from valveflow_ros.errors import listed
+
 # Pieces of a line: the text of each, and one of the styles below or '' for plain.
 Line = tuple[tuple[str, str], ...]
 
@@ -137,6 +139,26 @@ def _parser(
         raise ArgumentTypeError(f'must be {wanted}, such as {example}; {why}')
 
     return read
+
+
+def usage_sentence(message: str) -> str:
+    """Rewrite an error message of argparse as a sentence: the option first, then its error."""
+    missing = message.removeprefix('the following arguments are required: ')
+    if missing != message:
+        return f'Something is missing: {listed(missing.split(", "))}.'
+    words = message.removeprefix('unrecognized arguments: ')
+    if words != message:
+        return f"'{words}' is one argument too many."
+    about = re.fullmatch(r'argument (\S+): (.*)', message.removesuffix('.'), re.DOTALL)
+    if about is None:
+        return f'{message[:1].upper()}{message[1:].removesuffix(".")}.'
+    name, problem = about[1].rpartition('/')[2], about[2]
+    if problem.startswith('expected one argument'):
+        return f'{name} wants a value after it.'
+    choice = re.fullmatch(r'invalid choice: (.*) \(choose from (.*)\)', problem)
+    if choice is not None:
+        return f'{name} must be one of {choice[2].replace(chr(39), "")}, not {choice[1]}.'
+    return f'{name} {problem}.' if problem.startswith('must ') else f'{name}: {problem}.'
 
 
 def zone_argument(parser: ArgumentParser) -> None:
