@@ -109,6 +109,15 @@ def test_only_sections_for_the_monitor_count(run, tmp_path):
     assert '1 parameter, 1 differs from its default' in run('config', 'check', file).out
 
 
+def test_parameters_of_every_node_are_taken(run, tmp_path):
+    file = tmp_path / 'x.yaml'
+    own = '/**:\n  ros__parameters:\n    delay: 3.0\n    use_sim_time: true\n    qos_overrides'
+    for text in (':\n      /valve_opening:\n        subscription:\n          depth: 5\n',
+                 './valve_opening.subscription.depth: 5\n'):  # fmt: skip
+        file.write_text(own + text)
+        assert '1 parameter, 1 differs from its default' in run('config', 'check', file).out
+
+
 @pytest.mark.parametrize(
     'text', ['/unit_1:\n  valveflow_monitor:\n    ros__parameters:\n      delay: 3.0\n',
              '/**:\n  ros__parameters:\n']

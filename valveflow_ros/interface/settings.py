@@ -30,6 +30,8 @@ _ROUND_S = (1.0, 2.0, 5.0, 6.0, 10.0, 12.0, 15.0, 20.0, 30.0, 60.0, 120.0, 300.0
 ONE_FIT = {'refit_period': 0.0, 'refit_segments': 0}
 # The name of the monitor's node; the executable is called `monitor`.
 NODE = 'valveflow_monitor'
+# Parameters that every ROS node has.
+_OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 _TRUE, _FALSE = ('true', 'yes', 'on'), ('false', 'no', 'off')
 
 
@@ -244,10 +246,12 @@ def _flat(content: dict[Any, Any]) -> dict[str, Any]:
     """Return the values from below ``node: ros__parameters:`` or from the top level."""
     values: dict[str, Any] = {}
     for name, value in content.items():
+        if str(name).partition('.')[0] in _OF_ROS:
+            continue
         if isinstance(value, dict):
             inner = value.get('ros__parameters', value)
             values |= _flat(inner if isinstance(inner, dict) else {})
-        elif name != 'use_sim_time':
+        else:
             values[str(name)] = value
     return values
 
