@@ -44,7 +44,7 @@ _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
 _HIDDEN, _NULL = 'hidden_34000_34005', 'null_34000_34149'
-_SMALL = 'diagnosis_hidden_34100_34102_5d'
+_SMALL = 'diagnosis_hidden_30000_30002_5d'
 _NAMES = {
     'means over a minute': 'thermal_names_minute_3201_3217',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
@@ -420,12 +420,11 @@ def installed() -> str:
         (
             row['python'], ', '.join(row['versions'][name] for name in names),
             f'{row["install_s"]:.0f} s', f'{row["size_mb"]} MB',
-            f'{row["size_without_pyc_mb"]} MB',
             f'{row["first_identify_s"]:.0f} s', f'{row["second_identify_s"]:.1f} s',
         )
         for row in kept['results']
     )  # fmt: skip
-    head = ('Python', 'NumPy, SciPy, pandas, Numba', 'installed in', 'size', 'without .pyc',
-            'first `identify`', 'second')  # fmt: skip
+    head = ('Python', 'NumPy, SciPy, pandas, Numba', 'installed in', 'size', 'first `identify`',
+            'second')  # fmt: skip
     where = f'{kept["cpus"]} processors with a load average of {kept["load_average"]}'
     return f'{table(head, rows)}\nMeasured on {where}.\n'

@@ -68,11 +68,9 @@ def version(python: str) -> tuple[int, int]:
     return major, minor
 
 
-def megabytes(folder: Path) -> tuple[int, int]:
-    """Return the size of the files below a folder in 1e6 bytes, and without .pyc files."""
-    sizes = [(p.lstat().st_size, p.suffix == '.pyc') for p in folder.rglob('*') if p.is_file()]
-    whole, bare = sum(s for s, _ in sizes), sum(s for s, compiled in sizes if not compiled)
-    return round(whole / 1e6), round(bare / 1e6)
+def megabytes(folder: Path) -> int:
+    """Return the size of the files below a folder in units of 1e6 bytes."""
+    return round(sum(p.lstat().st_size for p in folder.rglob('*') if p.is_file()) / 1e6)
 
 
 def build(folder: Path) -> Path:
@@ -94,7 +92,7 @@ def trial(python: str, wheel: Path, libraries: tuple[str, ...], folder: Path) ->
     empty = megabytes(folder / 'venv')
     say('wheel and libraries are downloaded and installed')
     install_s, _ = run([inside / 'python', '-m', 'pip', 'install', wheel, *libraries], folder)
-    size, bare = (a - b for a, b in zip(megabytes(folder / 'venv'), empty, strict=True))
+    size = megabytes(folder / 'venv') - empty
     frozen = run([inside / 'python', '-m', 'pip', 'freeze'], folder)[1]
     cache = {'NUMBA_CACHE_DIR': str(folder / 'compiled')}
     say('half a day is simulated')
@@ -108,7 +106,6 @@ def trial(python: str, wheel: Path, libraries: tuple[str, ...], folder: Path) ->
     again_s, _ = run([inside / 'valveflow', *IDENTIFY], folder, **cache)
     return {
         'versions': dict(LIBRARIES.findall(frozen)), 'install_s': install_s, 'size_mb': size,
-        'size_without_pyc_mb': bare,
         'help_s': help_s, 'first_identify_s': first_s, 'second_identify_s': again_s,
     }  # fmt: skip
 
