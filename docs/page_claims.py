@@ -43,7 +43,7 @@ _COVERAGE = 'coverage_9500_9699'
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_34000_34005', 'null_34000_34149'
+_HIDDEN, _NULL = 'hidden_34000_34005', 'null_33000_33149'
 _SMALL = 'diagnosis_hidden_30000_30002_5d'
 _NAMES = {
     'means over a minute': 'thermal_names_minute_3201_3217',
@@ -329,15 +329,17 @@ def results() -> str:
         ('95 % intervals that contain the true value, 200 random plants', _covered()),
         (f'the curve on {_total((thermal[k] for k in _KIND_WORDS), "units")} units built from '
          'physics, means over a minute',
-         f'error {min(medians):.2f} to {max(medians):.2f} MW in the median, '
-         f'{max(e["largest"] for e in errors):.2f} MW at most; the right form in '
+         'root mean square error at the weather of the same days '
+         f'{min(medians):.2f} to {max(medians):.2f} MW in the median, '
+         f'{max(e["largest"] for e in errors):.2f} MW for the worst unit; the right form in '
          f'{_total((thermal[k] for k in _KIND_WORDS), "right_axis")}; {_slopes(thermal)} % of the '
          '95 % intervals of slopes contain the true value'),
         ('alarms in 20 days: healthy units, and units in which an effect of three times its '
          'default size begins on day 10',
          f'{healthy["paper"]["alarms"]} false ones in {20 * healthy["paper"]["units"]} days on '
          f'the plant of the paper, {_total(physics, "alarms")} in '
-         f'{20 * _total(physics, "units")} days on units built from physics; the effect raised '
+         f'{20 * _total(physics, "units")} days on units built from physics, on '
+         f'{_total(physics, "with_alarm")} of {_total(physics, "units")} units; the effect raised '
          f'one in {found} of {tried} runs, still active on day 20 in {stood}'),
         ("plants of the paper's kind, five days: healthy, and with one hidden effect of 2 to 3 "
          'times the detection limit',

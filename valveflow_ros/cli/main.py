@@ -44,7 +44,7 @@ VERBS: tuple[tuple[str, str, str], ...] = (
     ('import', 'import_table', 'make a log from a table of a historian'),
     ('info', 'info', 'show the contents and the quality of a log'),
     ('identify', 'identify', 'find the flow characteristic'),
-    ('diagnose', 'diagnose', 'find the cause where simulation and measurement differ'),
+    ('diagnose', 'diagnose', 'find the cause where the power differs from the curve'),
     ('monitor', 'monitor', 'run the monitor over a log: its curves, alarms and diagnoses'),
     ('fleet', 'fleet', 'identify, diagnose and monitor many logs of many units'),
     ('validate', 'validate', 'check a characteristic with a log of other days'),
