@@ -43,8 +43,8 @@ _COVERAGE = 'coverage_9500_9699'
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_34000_34005', 'null_33000_33149'
-_SMALL = 'diagnosis_hidden_30000_30002_5d'
+_HIDDEN, _NULL = 'hidden_34000_34005', 'null_34000_34149'
+_SMALL = 'diagnosis_hidden_34100_34102_5d'
 _NAMES = {
     'means over a minute': 'thermal_names_minute_3201_3217',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
@@ -197,9 +197,8 @@ def _diagnosis() -> list[Row]:
         *rows,
         _row(
             'one hidden effect of 1 to 1.5 times the smallest detectable size',
-            f'named in {r["right"]} of {r["records"]}, none named in {silent}, another one named '
-            f'in {beside}; in {beside - r["named_with_confidence_wrongly"]} of these the true one '
-            'is told as possible too', _SMALL,
+            f'named in {r["right"]} of {r["records"]}, none named in {silent}, another one in '
+            f'{beside}', _SMALL,
         ),
         *healthy,
         _since_model(),
