@@ -78,9 +78,11 @@ def covered(case: Case, found: Diagnosis) -> dict[str, list[Any]]:
 
 
 def told_of(true: Collection[str], names: Iterable[str]) -> set[str]:
-    """Return the names, a change of the curve as the bump that it is."""
-    bump = 'curve_shape'
-    return {bump if name == CURVE and bump in true else name for name in names}
+    """Return the names; a change of the curve is the bump, if that has no other name."""
+    bump, told = 'curve_shape', set(names)
+    if bump in true and bump not in told and CURVE in told:
+        told = told - {CURVE} | {bump}
+    return told
 
 
 def right(case: Case, found: Diagnosis) -> bool:

@@ -208,7 +208,10 @@ def _diagnosis() -> list[Row]:
 def _bends(study: dict[str, Any]) -> str:
     """Return in how many of the records with a bend of the curve everything was named."""
     bends = [row['right'] for row in study['rows'] if 'curve_shape' in row['label']]
-    return f'{sum(bends)} of the {len(bends)} with a bend of the curve, given an earlier model'
+    return (
+        f'{sum(bends)} of the {len(bends)} with a bend of the curve, told as a bend or as a '
+        'change since the model given'
+    )
 
 
 def _since_model() -> Row:
@@ -344,7 +347,7 @@ def results() -> str:
          'times the detection limit',
          f'nothing named in {null["right"]} of {null["records"]}; the effect named, and no '
          f'other, in {hidden["right"]} of {hidden["records"]} ({_bends(hidden)}), another name '
-         f'with confidence in {hidden["named_with_confidence_wrongly"]}'),
+         f'with confidence in {hidden["named_with_confidence_wrongly"]} of these'),
         ('units built from physics, with an effect or healthy: [a benchmark](docs/naming.md)',
          f'right answers in {_total(named, "right")} of {_total(named, "records")}, a wrong or '
          f'further name in {_total(named, "wrong")}'),

@@ -86,7 +86,7 @@ BAD_FILES = [
     ('/**:\n  ros__parameters:\n  delay: 3.0\n', ['Put the lines']),
     ('monitor:\n  ros__parameters:\n    delay: 3.0\n/u1/page:\n  ros__parameters:\n    a: 1\n',
      ["no section for the node valveflow_monitor, only 'monitor' and '/u1/page'",
-      "Name the section '/**:' or 'valveflow_monitor:'"]),
+      "Name the section '/**:'."]),
 ]  # fmt: skip
 
 

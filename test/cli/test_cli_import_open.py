@@ -303,3 +303,16 @@ def test_what_import_understood_of_a_flow_stays_in_its_recording(run, tmp_path):
     assert given['generated_power_unit'] == 'kg/s'
     assert 'pressure difference' in told[0]
     assert json.loads(read.contents.attachments['import.json'])['signals'][1]['unit'] == 'MPad'
+
+
+@pytest.mark.parametrize(
+    ('last', 'proposed'),
+    [('TE_MS', '--column main_steam_temperature=TE_MS'),
+     ('Remark', '--constant main_steam_temperature=540')],
+)  # fmt: skip
+def test_a_last_column_is_proposed_as_temperature_if_its_tag_is_that_of_a_thermometer(
+    run, write_csv, last, proposed
+):
+    rows = [f'{1700000000 + k},50,13,200,{540 + 0.01 * (k % 7)}' for k in range(20)]
+    path = write_csv(f'time,valve_opening,main_steam_pressure,generated_power,{last}', rows)
+    assert proposed in run('import', path, '--dry-run').refused().splitlines()[-1]

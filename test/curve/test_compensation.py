@@ -80,7 +80,7 @@ def test_a_flat_end_is_named_and_the_useful_part_stops_before_it():
     assert made.gain_limit == pytest.approx(5.0 / 0.24)
     assert made.useful_mw == pytest.approx((150.0, float(PAPER.values()[3])))
     assert any('Piece 4 (u 1900 to 2280' in note for note in made.notes)
-    flat = made.u > 1900.0 + 1e-6
+    flat = made.u >= 1900.0 - 1e-6
     assert not made.within[flat].any()
     assert made.within[~flat].all()
     assert made.largest_step == pytest.approx(9.0)

@@ -102,7 +102,7 @@ class Compensation:
     u: FloatArray  # (n,), not decreasing
     u_stderr: FloatArray  # (n,)
     gain: FloatArray  # (n,) units of u per MW to the next point; the last one is repeated
-    within: np.ndarray  # bool (n,): the gain before or after is within its limit
+    within: np.ndarray  # bool (n,): the gain from this row to the next is within its limit
     curve: Characteristic  # the part of the curve that was inverted
     gains: FloatArray  # (J,) units of u per MW of each of its pieces
     gain_limit: float
@@ -157,11 +157,9 @@ def compensate(
     gains = np.array([1.0 / p.slope for p in cut.pieces])
     limit = _STEEP * float(gains.min()) if gain_limit is None else gain_limit
     table_mw, table_u = _table_errors(cut, x, u)
-    good = gain <= limit * (1.0 + 1e-9)
-    good[1:] |= good[:-1]  # the last row of a useful piece is the first one of the next
     made = Compensation(
         power_mw=x, u=u, u_stderr=_u_error(cut, u), gain=gain,
-        within=good, curve=cut, gains=gains, gain_limit=limit,
+        within=gain <= limit * (1.0 + 1e-9), curve=cut, gains=gains, gain_limit=limit,
         largest_step=_largest_step(gains), useful_mw=_useful(cut, gains, limit),
         identity_mw=_identity(cut), table_mw=table_mw, table_u=table_u, jumps=_jumps(cut),
         first_piece=first, notes=(),

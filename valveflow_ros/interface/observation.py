@@ -45,7 +45,7 @@ from valveflow_ros.records import (
     Signal,
     SpecialSegment,
 )
-from valveflow_ros.report.data import REASON_WORDS
+from valveflow_ros.report.data import reason_words
 from valveflow_ros.report.first_run import SENTENCE, compile_beside, is_first_run
 from valveflow_ros.report.words import duration, moment
 from valveflow_ros.segments.kernel import WARM_UP, WINDOW
@@ -261,9 +261,9 @@ def check_signals(table: SampleTable, counts: dict[str, dict[str, int]]) -> None
                 f'The log has no {info.topic}; name yours with --column {info.topic}=THEIRS'
                 f'{constant if steam else ""}.'
             )
-        told = ', '.join(f'{REASON_WORDS.get(r, r)} ({n} times)' for r, n in refused.items())
         raise DataError(
-            f'{info.topic} has no usable value: {told}. Is it the right column, in its unit?'
+            f'{info.topic} has no usable value: {reason_words(refused)}. Is it the right column, '
+            'in its unit?'
         )
 
 

@@ -167,7 +167,7 @@ def _from_file(file: Path, of_node: bool) -> dict[str, Any]:
     if of_node and (problem := unmatched(content)):
         raise InputError(
             f'{file} {problem}: the monitor would ignore it and run with its defaults. Name the '
-            f"section '/**:' or '{NODE}:'."
+            "section '/**:'."
         )
     if of_node:
         content = {name: values for name, values in sections(content) if applies(name)}

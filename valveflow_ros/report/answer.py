@@ -205,6 +205,10 @@ def gain_by_load(data: Identified) -> list[LoadGain]:
     return found
 
 
+def _load(gain: LoadGain) -> str:
+    return say.decimals(gain.load, 0 if gain.load % 1.0 == 0.0 else 1)
+
+
 def _load_head(data: Identified) -> str:
     unit = data.characteristic.output_unit
     return f'{"flow" if unit in FLOW_UNITS else "load"} ({unit})'
@@ -218,7 +222,7 @@ def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
             f'{unit} per 1 % of opening', '95 % interval', 'over the usual range']  # fmt: skip
     cells = [
         [
-            say.decimals(g.load, 0 if g.load % 1.0 == 0.0 else 1),
+            _load(g),
             say.decimals(g.pressure, digits),
             f'{say.decimals(g.pressure_low, digits)} to {say.decimals(g.pressure_high, digits)}',
             say.decimals(g.opening, 1), say.plain(g.gain, 3),
@@ -352,8 +356,7 @@ def _bends(data: Identified) -> str:
     gains, said = sorted(gain_by_load(data), key=lambda g: g.gain), ''
     if len(gains) > 1:
         least, most = (
-            f'{say.plain(g.gain, 2)} {unit} at {say.decimals(g.load, 0)} {unit}'
-            for g in (gains[0], gains[-1])
+            f'{say.plain(g.gain, 2)} {unit} at {_load(g)} {unit}' for g in (gains[0], gains[-1])
         )
         said = f' One per cent of opening gives from {least} to {most}.'
     flat, *_, steep = sorted(c.pieces, key=lambda p: p.slope)

@@ -37,7 +37,8 @@ fixed openings, p^m F(V) + c, u is the opening, and the power belongs to one pre
 --pressure give one table below the other, with the pressure as the first column. A controller
 interpolates between them by the pressure.
 
-Columns named seen are 1 where identify saw this opening at about this pressure, else 0.
+The column within_gain_limit is 1 where the table may be used from this row to the next. Columns
+named seen are 1 where identify saw this opening at about this pressure, else 0.
 
 example:
   valveflow compensate --model result/characteristic.json -o table.csv --pressure 16.7"""

@@ -132,9 +132,9 @@ class Change:
         plain : Extended
             With a newly fitted curve, which is used for a change of the curve.
         """
-        same = replace(plain, active=self.given.active)
-        after = same if self.name == CURVE else self.changed
-        gain = sealed_gain(task, self.given, after, len(_KINDS) + 1)
+        # The causes found are judged after it.
+        after = plain if self.name == CURVE else self.changed.without_causes()
+        gain = sealed_gain(task, self.given.without_causes(), after, len(_KINDS) + 1)
         experiment = _EXPERIMENT if self.near else ''
         return NamedCause(
             self.name, self.sentence, self.parameters, gain, experiment, self.near,

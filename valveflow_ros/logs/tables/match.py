@@ -37,6 +37,7 @@ _LOCAL = {
 }  # fmt: skip
 PERIOD = '60s'
 _USUAL_DEGC = 540
+_THERMOMETER = re.compile(r'(?i)t[eitcr]{0,2}[ _.-]?\d|t[eit][_.-]')
 _GROUNDS = {
     EXACT: '', words.CLEAR: 'by its name', words.LIKELY: 'by its name', words.TAG: 'by its tag'
 }  # fmt: skip
@@ -144,15 +145,16 @@ class Matcher:
     ) -> None:  # fmt: skip
         """Propose a column for a missing signal if it is the only one left in a suitable unit.
 
-        A last column without a unit is proposed as the temperature, if only that is missing.
+        A last column without a unit whose name begins as the tag of a thermometer (ISA-5.1) does
+        is proposed as the temperature, if only that is missing.
         """
         cold = SIGNALS[Signal.MAIN_STEAM_TEMPERATURE].topic
         for info in SIGNALS:
             only = self._only_in_unit_of(info.signal, chosen) if info.topic in missing else None
             why, otherwise = 'in a unit of it', ''
             if only is None and missing == [cold] and info.topic == cold:
-                left = self._unused(chosen)
-                only = self.names[left[0]] if len(left) == 1 and not self._units[left[0]] else None
+                left = [self.names[k] for k in self._unused(chosen) if not self._units[k]]
+                only = left[0] if len(left) == 1 and _THERMOMETER.match(left[0]) else None
                 why, otherwise = 'left', f', else --constant {cold}={_USUAL_DEGC}'
             if only is not None:
                 missing.remove(info.topic)

@@ -55,7 +55,7 @@ def gain_step(values: Values, hooks: Hooks) -> None:
 
 
 @effect(
-    'The pressure or position transmitter drifts: the same reading passes more and more steam.',
+    'The pressure or position transmitter drifts: at the same reading more or less steam flows.',
     Parameter('g', 0.01, '1/(10 d)', 'Relative change in ten days.', -0.2, 0.2),
 )
 def input_drift(values: Values, hooks: Hooks) -> None:
@@ -70,7 +70,7 @@ def input_drift(values: Values, hooks: Hooks) -> None:
 
 
 @effect(
-    'The pressure or position transmitter is recalibrated: the same reading passes more steam.',
+    'A transmitter is recalibrated: from then on more or less steam flows at the same reading.',
     Parameter('g', 0.006, '', 'Relative change.', -0.2, 0.2),
     ONSET,
 )
