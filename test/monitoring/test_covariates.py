@@ -151,7 +151,7 @@ def test_values_that_wait_for_rows_are_bounded_and_a_state_without_them_is_read(
 @pytest.mark.parametrize(
     ('text', 'sentence'),
     [
-        ('vacuum', "entry 'vacuum' is not of the form NAME=COLUMN[:UNIT]."),
+        ('vacuum', "entry 'vacuum' is not of the form NAME=TOPIC[:UNIT]."),
         ('a=/x a=/y', 'entry a is given twice.'),
         (' '.join(f'a{k}=/x{k}' for k in range(11)), 'has 11 entries, at most 10.'),
     ],
