@@ -200,9 +200,23 @@ def _diagnosis() -> list[Row]:
             f'named in {r["right"]} of {r["records"]}, none named in {silent}, another one in '
             f'{beside}', _SMALL,
         ),
+        _learners(),
         *healthy,
         _since_model(),
     ]  # fmt: skip
+
+
+def _learners() -> Row:
+    """Return how the extended model compares with learners that know no cause."""
+    named = result('learners_35000_35000')['named']
+    best, less = named['at_least_as_good_as'], named['median_reduction']
+    return _row(
+        f'the extended model of {named["records"]} records with a named effect, against a Gaussian '
+        'process and gradient boosting that learn the residual, on blocks kept out',
+        f'at least as good in {best["gaussian_process"]} and {best["boosting"]}; median reduction '
+        f'of the error {100.0 * less["extended"]:.1f} %, {100.0 * less["gaussian_process"]:.1f} % '
+        f'and {100.0 * less["boosting"]:.1f} %', 'learners_35000_35000',
+    )  # fmt: skip
 
 
 def _bends(study: dict[str, Any]) -> str:
