@@ -211,8 +211,8 @@ def _learners() -> Row:
     named = result('learners_35000_35000')['named']
     best, less = named['at_least_as_good_as'], named['median_reduction']
     return _row(
-        f'the extended model of {named["records"]} records with a named effect, against a Gaussian '
-        'process and gradient boosting that learn the residual, on blocks kept out',
+        f'the extended model of {named["records"]} records with a named effect, against a '
+        'Gaussian process and gradient boosting that learn the residual, on blocks kept out',
         f'at least as good in {best["gaussian_process"]} and {best["boosting"]}; median reduction '
         f'of the error {100.0 * less["extended"]:.1f} %, {100.0 * less["gaussian_process"]:.1f} % '
         f'and {100.0 * less["boosting"]:.1f} %', 'learners_35000_35000',
