@@ -193,7 +193,7 @@ _LEAST_EXPLAINED = 0.001
 # A slack shows at reversals only, where the straight pieces of a healthy valve matter less: fixed
 # on the sets 88001 and 89001 of `benchmarks.naming`, where false ones explained up to 0.0003.
 _LEAST_SLACK = 0.0004
-BEND = 'curve_shape'
+_BEND = 'curve_shape'
 # Causes that change the level of the power in time, and equivalent shapes, by their families.
 _LEVELS = (
     'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
@@ -340,7 +340,7 @@ def diagnose(
     if given and found.model.active and not dropped:
         # Their mean effect on the record hides or imitates a change before it.
         since = since_model(task, model, found.model.active)
-        if isinstance(since, Change) and since.name == CURVE and BEND in found.model.names:
+        if isinstance(since, Change) and since.name == CURVE and _BEND in found.model.names:
             since = ''  # the bend is that change
     return _conclude(record, found, rest, wrong, since, progress)
 
