@@ -34,14 +34,24 @@ hypothesis.settings.load_profile('valveflow')
 
 
 @pytest.fixture(autouse=True)
-def _signals_as_before() -> Iterator[None]:
-    """A node that ends in this process ignores signals, and what a later test starts would too."""
+def _process_as_before() -> Iterator[None]:
+    """Put signals and environment back.
+
+    A node that ends in this process ignores signals, and one that starts in it selects a transport
+    in the environment. A process that a later test starts would inherit both.
+    """
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.getsignal(number) for number in numbers]
+    environment = dict(os.environ)
     yield
     for number, handler in zip(numbers, before, strict=True):
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    for name, value in environment.items():
+        if os.environ.get(name) != value:
+            os.environ[name] = value
 
 
 # Above 101 a domain's ports run into those that Linux hands out to anybody.

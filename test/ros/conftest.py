@@ -4,15 +4,11 @@
 
 import importlib.util
 import os
-import signal
 from pathlib import Path
-from signal import SIGHUP, SIGINT, SIGTERM
 
 import pytest
 from ros_helpers import Processes
 
-TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
-PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 HERE = Path(__file__).resolve().parent
 # Without rclpy nothing here can even be imported. `make test` promises it and then fails loudly.
 if importlib.util.find_spec('rclpy') is None and not os.environ.get('VALVEFLOW_REQUIRE_ROS'):
@@ -57,20 +53,6 @@ def processes(ros_environment, tmp_path):
     made = Processes(ros_environment, tmp_path)
     yield made
     made.end_all()
-
-
-@pytest.fixture
-def here(ros_environment, monkeypatch):
-    """Let a test call the main function of a node in this process.
-
-    Signals are put back, and so is what it chose in the environment for the middleware.
-    """
-    for name in (TRANSPORTS, *PROFILES):
-        monkeypatch.setenv(name, '')
-    kept = {number: signal.getsignal(number) for number in (SIGINT, SIGTERM, SIGHUP)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
 
 
 @pytest.fixture

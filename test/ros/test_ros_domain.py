@@ -111,7 +111,7 @@ class Graph:
 
 
 @pytest.fixture
-def graph(monkeypatch, ros_environment, here):
+def graph(monkeypatch, ros_environment):
     made = Graph()
     monkeypatch.setattr(rclpy, 'create_node', made.create)
     yield made
@@ -171,7 +171,7 @@ def test_it_shows_itself_only_where_that_helps_and_is_allowed(graph, monkeypatch
         presence.close()
 
 
-@pytest.mark.usefixtures('ros_environment', 'here')
+@pytest.mark.usefixtures('ros_environment')
 def test_a_signal_while_the_monitor_loads_ends_it_at_once(monkeypatch, capfd):
     reached = []
 
@@ -189,7 +189,6 @@ def test_a_signal_while_the_monitor_loads_ends_it_at_once(monkeypatch, capfd):
     assert not rclpy.ok()
 
 
-@pytest.mark.usefixtures('here')
 def test_signals_cut_only_where_they_may_and_only_once():
     stop = StopFlag().install()
 

@@ -57,7 +57,6 @@ def named(name):
     return importlib.import_module(f'valveflow_ros.ros.{MAINS[name]}').main
 
 
-@pytest.mark.usefixtures('here')
 def test_help_is_a_page_and_its_example_works(context, processes, tmp_path, capsys):
     # A player begins once somebody listens to every input.
     ears = Node('ears', context=context)
@@ -159,7 +158,7 @@ PARAMETERS = {
 }  # fmt: skip
 
 
-@pytest.mark.usefixtures('ros_environment', 'here')
+@pytest.mark.usefixtures('ros_environment')
 @pytest.mark.parametrize(('name', 'words', 'said', 'status'), REFUSED)
 def test_what_cannot_be_done_is_said_in_a_sentence(
     capfd, monkeypatch, tmp_path, name, words, said, status

@@ -123,7 +123,7 @@ def test_a_file_of_another_kind_is_refused_with_a_sentence(tmp_path, parameter, 
 
 
 @pytest.mark.ros
-@pytest.mark.usefixtures('ros_environment', 'here')
+@pytest.mark.usefixtures('ros_environment')
 @pytest.mark.parametrize('parameter', ['model_file', 'reference_file'])
 def test_a_bad_file_keeps_the_node_from_starting(capfd, tmp_path, parameter):
     words = ['--ros-args', '-p', f'{parameter}:={tmp_path}/gone.json', '-p', 'record:=false']

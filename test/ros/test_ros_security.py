@@ -99,7 +99,6 @@ def demanded(monkeypatch, tmp_path, ros_environment):
     return demand
 
 
-@pytest.mark.usefixtures('here')
 def test_no_start_where_security_is_demanded_and_cannot_be_had(demanded, capfd):
     for (name, run, arguments), (environment, words) in REFUSED:
         demanded(environment)
