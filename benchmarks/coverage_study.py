@@ -6,11 +6,13 @@ Run: ``python -m benchmarks.coverage_study --seeds 200 --first 9000``. Each seed
 (rated power, 2 to 6 pieces, 1 to 3 regions, noise, load programme, 1 or 2 s sampling) and runs it
 for ten days. Parameters are compared where the number of pieces (of regions) is the true one; how
 often it is, how sure the fit is of it, and whether a too simple curve is wrong by more than noise,
-is told beside. With ``--days 2`` some breakpoints are hardly visible.
+is told beside. With ``--days 2`` some breakpoints are hardly visible. ``--recording minute``
+identifies means over a minute instead.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -20,6 +22,7 @@ import numpy as np
 from benchmarks import study
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.plant.unit import UnitDescription, random_unit
+from valveflow_ros.signals.static_form import INTEGRATED_INPUT
 
 _Z95 = 1.959963984540054
 _KINDS = ('slope', 'intercept', 'knee', 'time_constant', 'delay')
@@ -28,6 +31,8 @@ _KINDS = ('slope', 'intercept', 'knee', 'time_constant', 'delay')
 def scores(found: Characteristic, unit: UnitDescription) -> Iterator[tuple[str, float]]:
     """Yield each parameter's error over its standard error."""
     truth = unit.curve
+    if found.axis != INTEGRATED_INPUT:
+        return
     if len(found.pieces) == len(truth.slopes):
         for piece, slope, intercept in zip(
             found.pieces, truth.slopes, truth.intercepts, strict=True
@@ -45,11 +50,11 @@ def scores(found: Characteristic, unit: UnitDescription) -> Iterator[tuple[str, 
             yield 'delay', (own.delay_s - true.delay_s) / own.delay_stderr_s
 
 
-def judged(seed: int, days: float) -> dict[str, Any]:
+def judged(seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Draw one plant and identify it."""
     unit = random_unit(np.random.default_rng(seed))
     begin = time.process_time()
-    found = study.identify(unit, seed, days)
+    found = study.identify(unit, seed, given.days, given.recording)
     table: dict[str, list[float]] = {}
     for name, value in scores(found, unit):
         table.setdefault(name, []).append(round(float(value), 3))
@@ -88,9 +93,11 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    given = study.options(__doc__, seeds=200, first=9000, days=10.0).parse_args()
-    name = study.name_of('coverage', given)
-    rows = study.rows_of(name, judged, study.seeds(given), given.days)
+    parser = study.options(__doc__, seeds=200, first=9000, days=10.0)
+    parser.add_argument('--recording', choices=('1s', 'minute'), default='1s')
+    given = parser.parse_args()
+    name = study.name_of('coverage' + '_minute' * (given.recording == 'minute'), given)
+    rows = study.rows_of(name, judged, study.seeds(given), given)
     study.keep(name, days=given.days, summary=summary(rows), rows=rows)
 
 

@@ -6,7 +6,8 @@
     python -m benchmarks.diagnosis_study --kind null --seeds 24 --first 5000 --days 10
 
 Every plant is drawn: the unit (every third is the paper's), the size of what is hidden (2 to
-4 times the smallest detectable one), sign, onset and phase. Thresholds were fixed on seeds
+4 times the smallest detectable one), sign, onset and phase. ``--recording minute`` diagnoses
+means over a minute, without an earlier model. Thresholds were fixed on seeds
 below 1000.
 """
 
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+import valveflow_ros as vf
 from benchmarks import diagnosis_cases as plants
 from benchmarks import study
 from benchmarks.diagnosis_cases import Case
@@ -31,6 +33,7 @@ from valveflow_ros.diagnosis.diagnose import Record, diagnose
 from valveflow_ros.diagnosis.result import Diagnosis
 from valveflow_ros.errors import ValveflowError
 from valveflow_ros.fit.fit import fit, outline
+from valveflow_ros.interface.simulate import Simulation
 from valveflow_ros.plant.simulator import SimulatedLog, simulate
 from valveflow_ros.signals.static_form import StaticForm
 
@@ -107,7 +110,7 @@ def right(case: Case, found: Diagnosis) -> bool:
     return names == set(case.names) and not wrong_sign and unexplained == (case.kind == 'outside')
 
 
-def row_of(case: Case, days: float) -> dict[str, Any]:
+def row_of(case: Case, days: float, recording: str) -> dict[str, Any]:
     """Diagnose one plant and return what is counted."""
     about = {
         'kind': case.kind, 'label': case.label, 'seed': case.seed,
@@ -115,7 +118,11 @@ def row_of(case: Case, days: float) -> dict[str, Any]:
     }  # fmt: skip
     begin = time.process_time()
     try:
-        found = diagnose(*record_of(case, days), case.given)
+        if recording == 'minute':
+            plant = Simulation(simulated(case, days), days, case.seed)
+            found = vf.diagnose(study.means(plant)).diagnosis
+        else:
+            found = diagnose(*record_of(case, days), case.given)
     except ValveflowError as error:
         return {**about, 'verdict': 'refused', 'names': [], 'right': False, 'error': str(error),
                 'not_told_apart': [], 'parameters': {}}  # fmt: skip
@@ -178,9 +185,11 @@ def main() -> None:
     parser = study.options(__doc__, seeds=1, first=0, days=10.0, low=2.0, high=4.0)
     parser.add_argument('--kind', choices=KINDS, default='hidden')
     parser.add_argument('--effect', action='append')
+    parser.add_argument('--recording', choices=('1s', 'minute'), default='1s')
     given = parser.parse_args()
-    name = f'{study.name_of(f"diagnosis_{given.kind}", given)}_{given.days:g}d'
-    rows = study.rows_of(name, row_of, cases(given), given.days)
+    kind = given.kind + '_minute' * (given.recording == 'minute')
+    name = f'{study.name_of(f"diagnosis_{kind}", given)}_{given.days:g}d'
+    rows = study.rows_of(name, row_of, cases(given), given.days, given.recording)
     study.keep(
         name, right=sum(r['right'] for r in rows), records=len(rows),
         named_with_confidence_wrongly=sum(map(confidently_wrong, rows)),

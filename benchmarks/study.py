@@ -23,6 +23,7 @@ import valveflow_ros as vf
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.fit.fit import fit
 from valveflow_ros.fit.task import FitTask
+from valveflow_ros.interface.simulate import Simulation
 from valveflow_ros.monitoring.events import FitRequested, SegmentClosed
 from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
@@ -138,9 +139,14 @@ def task_of(table: SampleTable, settings: Settings) -> tuple[FitTask, list[Speci
     return task, [e.segment for e in events if isinstance(e, SegmentClosed)]
 
 
-def identify(unit: UnitDescription, seed: int, days: float) -> Characteristic:
-    """Simulate a unit and identify it with the defaults."""
-    return fit(task_of(simulate(days, seed, unit).table, whole_window(unit, days))[0])
+def identify(
+    unit: UnitDescription, seed: int, days: float, recording: str = '1s'
+) -> Characteristic:
+    """Simulate a unit and identify it with the defaults, from rows or from means over a minute."""
+    log = simulate(days, seed, unit)
+    if recording == 'minute':
+        return vf.identify(means(Simulation(log, days, seed))).characteristic
+    return fit(task_of(log.table, whole_window(unit, days))[0])
 
 
 def minute_means(
@@ -150,5 +156,10 @@ def minute_means(
     if kind != PAPER:
         unit = f'{kind}:number={number}'
         return vf.simulate(days, seed, effects, unit=unit, recording='minute').to_dataframe()
-    table = vf.simulate(days, seed, effects).to_dataframe().set_index('time')
+    return means(vf.simulate(days, seed, effects))
+
+
+def means(simulation: Simulation) -> pd.DataFrame:
+    """Return means over a minute of a record in rows."""
+    table = simulation.to_dataframe().set_index('time')
     return table.resample('60s').mean().reset_index()

@@ -148,7 +148,7 @@ def from_refined(
         notes=(
             *static.notes,
             *_form_errors(static, result, exponents_near(task.settings.real('pressure_exponent'))),
-            *_long_means(result),
+            *_long_means(result, step_s),
         ),
         pressure_scale_exponent=static.pressure_scale_exponent
         + (result.exponent_moved if static.axis == OPENING else 0.0),
@@ -194,14 +194,17 @@ def _form_errors(
     )
 
 
-def _long_means(result: Refined) -> tuple[str, ...]:
+def _long_means(result: Refined, step_s: float) -> tuple[str, ...]:
     """Return a note if the curve was fitted to long means."""
     if not result.long_s:
         return ()
-    return (
-        f'The curve was fitted to means over {result.long_s / 60.0:.3g} min: fast movements would '
-        'give another curve, because one lag does not describe them well enough.',
-    )
+    why = 'the valve moves within the time between two rows.'
+    if step_s < COARSE_STEP_S:
+        why = (
+            'fast movements would give another curve, because one lag does not describe them well '
+            'enough.'
+        )
+    return (f'The curve was fitted to means over {result.long_s / 60.0:.3g} min: {why}',)
 
 
 def _time_error(time_s: float, error_s: float, step_s: float) -> float:
