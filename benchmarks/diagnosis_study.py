@@ -25,6 +25,7 @@ import numpy as np
 import valveflow_ros as vf
 from benchmarks import diagnosis_cases as plants
 from benchmarks import study
+from benchmarks.diagnosis_best import best_of, summary
 from benchmarks.diagnosis_cases import Case
 from benchmarks.diagnosis_outside import OUTSIDE, SLOW, added_to, slowly
 from valveflow_ros.curve.regional_model import RegionalModel
@@ -112,7 +113,7 @@ def right(case: Case, found: Diagnosis) -> bool:
 
 def row_of(case: Case, days: float, recording: str) -> dict[str, Any]:
     """Diagnose one plant and return what is counted."""
-    about = {
+    about: dict[str, Any] = {
         'kind': case.kind, 'label': case.label, 'seed': case.seed,
         'effects': [str(e) for e in case.effects],
     }  # fmt: skip
@@ -122,7 +123,10 @@ def row_of(case: Case, days: float, recording: str) -> dict[str, Any]:
             plant = Simulation(simulated(case, days), days, case.seed)
             found = vf.diagnose(study.means(plant)).diagnosis
         else:
-            found = diagnose(*record_of(case, days), case.given)
+            record, model = record_of(case, days)
+            found = diagnose(record, model, case.given)
+            if case.effects:
+                about['best'] = best_of(case, record, model, found)
     except ValveflowError as error:
         return {**about, 'verdict': 'refused', 'names': [], 'right': False, 'error': str(error),
                 'not_told_apart': [], 'parameters': {}}  # fmt: skip
@@ -193,6 +197,7 @@ def main() -> None:
     study.keep(
         name, right=sum(r['right'] for r in rows), records=len(rows),
         named_with_confidence_wrongly=sum(map(confidently_wrong, rows)),
+        visible_at_best=summary(rows),
         table={label: counts(own) for label, own in study.by('label', rows).items()}, rows=rows,
     )  # fmt: skip
 
