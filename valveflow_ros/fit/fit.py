@@ -155,11 +155,13 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
     settings = task.settings
     rows = task.contents.special_rows()
     enough_samples(task, len(rows))
+    valve_moved(task, rows[np.isfinite(task.contents.u[rows])])
     progress('exact partition')
     formed = _formed(task)
     contents = formed.contents
     rows = rows[np.isfinite(contents.u[rows])]
     u, scale = contents.u[rows], formed.scales(rows)
+    input_moved(formed.task, u)
     least = max(2, math.ceil(settings.real('min_piece_share') * len(np.unique(u))))
     part = partition(
         u, (contents.power_mw[rows] - formed.offset_mw) / scale, settings.whole('max_pieces'),
@@ -167,8 +169,6 @@ def _begin(task: FitTask, progress: Progress) -> _Begun:
     )  # fmt: skip
     growth = _inflation(formed, part)
     selection = select(part, growth)
-    input_moved(formed.task, u)
-    valve_moved(task, rows)
     chosen = _pieces_of(part, selection.pieces, growth)
     carries_a_curve(formed.task, rows, len(chosen), formed.static(chosen, rows))
     choice = Choice('paper', selection.cost, selection.turning_angle, selection.note)
