@@ -25,6 +25,7 @@ from valveflow_ros.diagnosis.fitting import (
     level_tangents,
 )
 from valveflow_ros.diagnosis.grids import DAY_S, Grids
+from valveflow_ros.numerics import cores, run_in_threads
 from valveflow_ros.records import FloatArray
 
 # The part that the model itself could explain; it is removed before a cause is judged.
@@ -196,8 +197,13 @@ class Screening:
 
     def best(self, cause: Cause, grid: list[Values], keep: int = 1) -> list[Start]:
         """Return the starts with the largest gain."""
-        tried = sorted((self.displaced(cause, v) for v in grid), key=lambda s: -s.gain)
-        return [s for s in tried[:keep] if s.gain > 0.0]
+        tried = [Start(v, 0.0) for v in grid]
+
+        def work(k: int) -> None:
+            tried[k] = self.displaced(cause, grid[k])
+
+        run_in_threads(work, [(k,) for k in range(len(grid))], cores())
+        return [s for s in sorted(tried, key=lambda s: -s.gain)[:keep] if s.gain > 0.0]
 
     def scaled(self, cause: Cause, unit: Values) -> list[Start]:
         """Return the start of a cause with one parameter, from its effect at two small values.

@@ -59,7 +59,9 @@ _DRAWS, _ROUGH_DRAWS = 10, 5
 _SEED = 20_240
 _BANDS = (0.3, 0.5, 0.7, 0.95, 1.25, 1.6, 2.1, 2.8, 3.7, 4.9, 6.5, 8.6, 11.4, 15.0)
 _FACTORS = (0.88, 0.94, 1.0, 1.07, 1.15)
-_OVER_SLACK, _SHARES = (0.97, 1.04, 1.1), (0.15, 0.4, 0.6, 0.75, 0.9)
+# The cost is a narrow valley in S and J, 0.03 wide in J / S; a coarser grid misses it.
+_OVER_SLACK = (0.97, 1.01, 1.05, 1.09, 1.13, 1.17)
+_SHARES = (0.1, 0.2, 0.3, 0.4, *np.arange(0.45, 0.96, 0.05))
 _LIKE_SLACK = 3.0
 _SLACKS = (0.8, 0.86, 0.91, 0.95, 0.98, 1.0, 1.03, 1.07)
 _STEPS = (0.04, 0.02, 0.01, 0.005)
