@@ -169,6 +169,13 @@ def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
     assert error_mw(simulation, curve) < 1.0
 
 
+def test_where_neither_decides_the_likelier_form_of_all_rows_is_taken():
+    simulation = vf.simulate(8.0, 2335, unit='sequence:number=2335', recording='minute')
+    curve = vf.identify(simulation.log).characteristic
+    assert (curve.axis, curve.form.told) == (OPENING, False)
+    assert error_mw(simulation, curve) < 1.0  # 3.9 MW in the other form
+
+
 def test_a_model_of_the_wrong_form_is_the_first_finding_and_one_of_the_right_form_none(tmp_path):
     given = identified(INTEGRATED_INPUT).characteristic
     later = vf.simulate(3.0, 4, unit=UNIT, recording='minute')

@@ -244,10 +244,14 @@ def _found_in_all_rows(
     breaks = np.flatnonzero(np.diff(contents.time_ns) > 1.5e9 * period_s) + 1
     stretches = np.column_stack([np.append(0, breaks), np.append(breaks, len(pressure))])
     decided = find_form(*rows, stretches, period_s, exponent)
-    if decided is None or decided.evidence is None or not decided.evidence.told:
+    if decided is None or decided.evidence is None:
         return found
     same = decided.form.axis == found.form.axis
-    if same and found.evidence is not None and found.evidence.told:
+    known = found.evidence is not None and found.evidence.told
+    # If neither is sure, the form over V is taken that all rows make likelier.
+    if known and (same or not decided.evidence.told):
+        return found
+    if not decided.evidence.told and (same or not decided.form.scaled):
         return found
     form = decided.form if decided.form.scaled else StaticForm(INTEGRATED_INPUT, exponent)
     held = find_form(*rows, contents.spans[:, :2], period_s, exponent, held=form)
