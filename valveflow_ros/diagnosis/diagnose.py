@@ -586,10 +586,12 @@ def _explained(found: SearchResult, name: str) -> float:
 def _final(found: SearchResult) -> tuple[Task, Extended]:
     """Fit the extended model to all blocks, including the sealed ones."""
     task = replace(found.task, rows=found.task.grids.whole)
-    model, cost = improve(task, found.model, _LAST_STEPS)
+    everywhere = np.ones(task.grids.subs, dtype=bool)
+    # Before the fit: states that are wrong in the sealed blocks would make their effect too small.
+    model, cost = improve(task, inferred(task, found.model, everywhere), _LAST_STEPS)
     model, cost = search_levels(task, model, cost)
     model, _ = search_lines(task, model, cost)
-    return task, inferred(task, model, np.ones(task.grids.subs, dtype=bool))
+    return task, inferred(task, model, everywhere)
 
 
 def _meaning(task: Task, model: Extended, cause: FittedCause) -> str:
