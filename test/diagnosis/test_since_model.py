@@ -140,18 +140,18 @@ def test_a_change_within_three_of_its_errors_is_not_named(model):
     assert since(scaled_opening(1.02), model).name == 'input_change'
 
 
-@pytest.mark.parametrize(
-    ('change', 'names'),
-    [(unchanged, {'input_step'}), (scaled_power(0.97), {'gain_change', 'input_step'})],
-    ids=['within only', 'before and within'],
-)
-def test_a_change_within_the_record_is_told_from_one_before_it(model, change, names):
-    samples = table(DAYS, LATER, ('input_step:g=0.02,t0_days=1.2',), unit())
+@pytest.mark.parametrize('effect', ['input_step:g=0.02,t0_days=1.2', 'gain_drift:g=0.08'])
+@pytest.mark.parametrize('change', [unchanged, scaled_power(0.97)], ids=['sound', 'changed'])
+def test_a_change_within_the_record_is_told_from_one_before_it(model, change, effect):
+    own = effect.partition(':')[0]
+    samples = table(DAYS, LATER, (effect,), unit())
     values = samples.values.copy()
     change(values)
     found = diagnose(record(replace(samples, values=values)), model, given=True)
+    names = {own} if change is unchanged else {own, 'gain_change'}
     assert {c.name for c in found.causes} == names, found.sentence
     sizes = {c.name: c.parameters['g'] for c in found.causes}
-    assert sizes['input_step'].low <= 0.02 <= sizes['input_step'].high
+    truth = float(re.search(r'g=([\d.]+)', effect)[1])
+    assert sizes[own].low <= truth <= sizes[own].high
     if 'gain_change' in sizes:
         assert sizes['gain_change'].low <= -0.03 <= sizes['gain_change'].high

@@ -323,10 +323,16 @@ def diagnose(
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
     since = since_model(task, model) if given else ''
-    start, earlier_curve = Extended(model if given else simplified(model)), given
-    if isinstance(since, Change):
-        start, earlier_curve = since.changed, since.name != CURVE
-    found = search(task, start, progress, rough, earlier_curve=earlier_curve)
+    start = since.changed if isinstance(since, Change) else None
+    start = start or Extended(model if given else simplified(model))
+    found = search(task, start, progress, rough, earlier_curve=given)
+    if isinstance(since, Change) and since.name == CURVE and _BEND in found.model.names:
+        # Is a bend the whole change of the curve, or only its largest part?
+        left = since_model(task, model, found.model.active)
+        if isinstance(left, Change) and left.name == CURVE and not left.near:
+            found = search(task, start, progress, rough, earlier_curve=False)
+        else:
+            since = left
     progress(0.7, 'the sealed blocks')
     confirm(found)
     _withdraw_small(found)

@@ -18,9 +18,11 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Estimate, FittedCause
+from valveflow_ros.diagnosis.causes.changes import ramp
 from valveflow_ros.diagnosis.evidence import more_or_less, sealed_gain, where_largest
 from valveflow_ros.diagnosis.extended import Extended, answer, drive
 from valveflow_ros.diagnosis.fitting import Task, levels_along
+from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.result import NamedCause
 from valveflow_ros.diagnosis.slow import PENALTY, Regression, half_hours, regressions
 from valveflow_ros.errors import short
@@ -91,6 +93,10 @@ _KINDS = {
         'Since the model given was found the power is {change} at every load', math.inf,
     ),
 }  # fmt: skip
+_DRIFTS = {
+    'gain_drift': 'gain_change', 'input_drift': 'input_change',
+    'output_offset_drift': 'offset_change',
+}  # fmt: skip
 SINCE_MODEL = (CURVE, *_KINDS)
 _BEFORE = 'it changed before this record begins'
 _EXPERIMENT = (
@@ -156,7 +162,7 @@ def since_model(
     named : tuple of FittedCause
         Causes found in the record: only what differs besides them is a change before it.
     """
-    given = Extended(base, named)
+    given = Extended(_as_it_began(task.grids, base, named), named)
     here = answer(task.grids, given)
     hats = _hats(here[task.rows])
     found = half_hours(
@@ -204,7 +210,25 @@ def since_model(
             f'Over the loads seen the record as a whole differs from the model given by '
             f'{size:.2g} MW (root mean square). {why}'
         )
-    return change
+    after = base if change.name == CURVE else _KINDS[best].act(base, value)
+    return replace(
+        change, given=Extended(base, named),
+        changed=_levels_as_fit(task, Extended(base, named), after),
+    )  # fmt: skip
+
+
+def _as_it_began(
+    grids: Grids, base: RegionalModel, named: tuple[FittedCause, ...]
+) -> RegionalModel:
+    """Return the curve with which the drifts named have no effect at the first row.
+
+    They are relative to the middle of the record: what they did until then is no change before it.
+    """
+    first = float(ramp(grids, np.zeros(1))[0])
+    for a in named:
+        if a.name in _DRIFTS:
+            base = _KINDS[_DRIFTS[a.name]].act(base, -first * a.values[0])
+    return base
 
 
 def _is_sure(estimate: Estimate) -> bool:
