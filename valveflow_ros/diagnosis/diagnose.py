@@ -77,9 +77,9 @@ from valveflow_ros.signals.static_form import StaticForm
 def confirm(found: SearchResult) -> None:
     """Remove causes that the sealed blocks do not confirm, the least likely first."""
     while found.model.active:
-        gains = gains_of(found, steps(found))
-        worst = max(range(len(gains)), key=lambda k: gains[k].p_value)
-        if gains[worst].p_value <= LARGEST_P:
+        chances = _chances(found)
+        worst = max(range(len(chances)), key=lambda k: chances[k])
+        if chances[worst] <= LARGEST_P:
             return
         name = found.model.active[worst].name
         found.model, _ = improve(found.task, found.model.without(name), 3)
@@ -87,7 +87,7 @@ def confirm(found: SearchResult) -> None:
         found.evidence.pop(name, None)
         found.reasons[name] = (
             'blocks of time that were kept out of the search do not confirm it (a gain as large '
-            f'there has a chance of {gains[worst].p_value:.2g})'
+            f'there has a chance of {chances[worst]:.2g})'
         )
 
 
@@ -101,8 +101,26 @@ def steps(found: SearchResult) -> list[Extended]:
 
 
 def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
-    """Return the gain of each cause on the sealed blocks over the model with the earlier ones."""
-    return [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
+    """Return the gain of each cause on the sealed blocks over the model with the earlier ones.
+
+    Its chance is that of its gain over the model with all others: without them it may explain
+    little, because what they leave is larger than its own effect.
+    """
+    gains = [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
+    if len(gains) < 2:
+        return gains
+    return [
+        replace(gain, p_value=chance) for gain, chance in zip(gains, _chances(found), strict=True)
+    ]
+
+
+def _chances(found: SearchResult) -> list[float]:
+    """Return the chance of a gain as large on sealed blocks, of each cause beside the others."""
+    out = []
+    for a in found.model.active:
+        without, _ = improve(found.task, found.model.without(a.name), 3)
+        out.append(sealed_gain(found.task, without, found.model, found.tried).p_value)
+    return out
 
 
 # Causes found without the model of the unit: in the actuator and in the record.

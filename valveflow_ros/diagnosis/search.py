@@ -227,6 +227,7 @@ def search(
         if not _add(found, barred):
             break
         _drop_weak(found, barred)
+        _exchange(found, barred)
         _conceal(found, barred)
     for name in catalogue():
         if (why := unseen(name, task.grids)) and name not in found.model.names:
@@ -461,6 +462,37 @@ def _refit(task: Task, model: Extended, tangents: FloatArray | None) -> tuple[Ex
     model, cost = search_lines(task, model, cost)
     model, cost = search_levels(task, model, cost, _SHORT_STEPS_MW)
     return improve(task, model, 3, tangents)
+
+
+def _exchange(found: SearchResult, barred: set[str]) -> None:
+    """Replace each earlier cause by one that was nearly as good, if that one is better now.
+
+    While the later causes were missing, the wrong one may have taken a part of their effect.
+    """
+    for a in found.model.active[:-1]:
+        near = {n for n in found.near.get(a.name, ()) if n not in {*barred, *found.model.names}}
+        if not near:
+            continue
+        without, _ = improve(found.task, found.model.without(a.name), 3)
+        part = SearchResult(found.task, without, found.plain, rough=found.rough)
+        others = set(causes_for(found.task.grids)) - near - {a.name}
+        rivals = _visible(part, _rivals(part, others), set())
+        if not rivals or rivals[0].added.name == a.name or rivals[0].added.beyond:
+            continue
+        best = rivals[0]
+        evidence = weigh(found.task, without, best.model, best.added.size)
+        if not evidence.enough:
+            continue
+        name = best.added.name
+        found.evidence.pop(a.name, None)
+        found.near.pop(a.name, None)
+        found.reasons.pop(name, None)
+        found.evidence[name] = evidence
+        found.near[name] = tuple(
+            r.added.name for r in rivals[1:] if r.score - best.score < NOT_TOLD_APART
+        )
+        found.reasons[a.name] = f'{name} explains the data better beside the causes found later'
+        _take(found, best, evidence.gain)
 
 
 def _drop_weak(found: SearchResult, barred: set[str]) -> None:
