@@ -140,8 +140,13 @@ def test_a_change_within_three_of_its_errors_is_not_named(model):
     assert since(scaled_opening(1.02), model).name == 'input_change'
 
 
-@pytest.mark.parametrize('effect', ['input_step:g=0.02,t0_days=1.2', 'gain_drift:g=0.08'])
-@pytest.mark.parametrize('change', [unchanged, scaled_power(0.97)], ids=['sound', 'changed'])
+_STEP, _DRIFT = 'input_step:g=0.02,t0_days=1.2', 'gain_drift:g=0.08'
+
+
+@pytest.mark.parametrize(
+    ('change', 'effect'), [(unchanged, _STEP), (scaled_power(0.97), _STEP), (unchanged, _DRIFT)],
+    ids=['a step', 'a change before and a step', 'a drift'],
+)  # fmt: skip
 def test_a_change_within_the_record_is_told_from_one_before_it(model, change, effect):
     own = effect.partition(':')[0]
     samples = table(DAYS, LATER, (effect,), unit())
