@@ -390,11 +390,15 @@ def _absorb(found: SearchResult, rival: Rival) -> None:
 
 
 def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]]:
-    """Return starts to be refitted: the best ones, and the families of the best ones."""
+    """Return starts to be refitted: the best ones, and the families of the best ones.
+
+    Backlash and stiction are two models of one slack: there is one of them only.
+    """
     every = causes_for(screening.task.grids)
+    single = {a.cause.family for a in screening.model.active} & {'slack'}
     starts: dict[str, list[Start]] = {}
     for name, cause in every.items():
-        if name not in barred and name not in screening.model.names:
+        if not (name in barred or name in screening.model.names or cause.family in single):
             starts[name] = list(cause.starts(screening))
     best = {n: max(s.gain for s in found) for n, found in starts.items() if found}
     if not best or max(best.values()) < SCREEN_LEAST:

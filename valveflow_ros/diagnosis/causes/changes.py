@@ -379,8 +379,12 @@ def apply_diurnal(values: Values, grids: Grids, extra: Values) -> FloatArray:
         x = F(u) (1 + a cos(2 pi (t - t_peak) / 24 h)),  t the time of day, UTC
     """
     a, peak_h = values
-    angle = 2.0 * np.pi * (grids.clock_s(grids.time_s) - peak_h * _HOUR_S) / DAY_S
-    return np.asarray(1.0 + a * np.cos(angle))
+    if 'day' not in grids.cache:
+        angle = 2.0 * np.pi * grids.clock_s(grids.time_s) / DAY_S
+        grids.cache['day'] = np.stack([np.cos(angle), np.sin(angle)])
+    peak = 2.0 * np.pi * peak_h * _HOUR_S / DAY_S
+    cosine, sine = grids.cache['day']
+    return np.asarray(1.0 + (a * np.cos(peak)) * cosine + (a * np.sin(peak)) * sine)
 
 
 def diurnal_starts(screening: Screening) -> Sequence[Start]:
