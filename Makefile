@@ -92,8 +92,8 @@ torture: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) for recording in '1s --seeds 10 --first 5001' 'minute --seeds 100 --first 2001' \
-	  'compressed --seeds 10 --first 1201'; do \
+	@$(ENV) for recording in '1s --seeds 10 --first 5201' 'minute --seeds 100 --first 2601' \
+	  'compressed --seeds 10 --first 1401'; do \
 	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input \
 	  --recording $$recording || exit 1; done
 

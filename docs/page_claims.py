@@ -45,7 +45,7 @@ _COVERAGE = {
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_34000_34005', 'null_34000_34149'
+_HIDDEN, _NULL = 'hidden_34000_34005', 'null_47000_47099'
 _SMALL = 'diagnosis_hidden_34100_34102_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
@@ -64,8 +64,8 @@ def _kind_words(kind: str) -> str:
 
 
 _RECORDINGS = {
-    'minute_2001_2100': 'means over a minute', '1s_5001_5010': 'every second',
-    'compressed_1201_1210': 'exceptions alone',
+    'minute_2601_2700': 'means over a minute', '1s_5201_5210': 'every second',
+    'compressed_1401_1410': 'exceptions alone',
 }  # fmt: skip
 
 
@@ -171,14 +171,14 @@ def _diagnosis() -> list[Row]:
     for name, question in (
         (_HIDDEN, 'one hidden effect: named, and no other'),
         (_NULL, 'nothing wrong: nothing named'),
-        ('slow_33000_33009',
+        ('slow_47200_47204',
          'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
          'may be named): told as a change in time, and nothing named'),
-        ('confounded_33000_33003', 'two causes that look alike'),
-        ('pair_34000_34003', 'two causes at once: both named'),
-        ('triple_34000_34003', 'three causes at once: all named'),
-        ('outside_33000_33002', 'effects outside the catalogue: none named'),
+        ('confounded_47300_47303', 'two causes that look alike'),
+        ('pair_46000_46005', 'two causes at once: both named'),
+        ('triple_46100_46105', 'three causes at once: all named'),
+        ('outside_47400_47402', 'effects outside the catalogue: none named'),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
         text = f'{r["right"]} of {r["records"]}'
@@ -186,7 +186,7 @@ def _diagnosis() -> list[Row]:
             wrong = r['named_with_confidence_wrongly']
             text += f' said to be unexplained, {wrong} named with confidence'
         if name.startswith(('hidden', 'pair', 'triple')):
-            text += f' ({_bends(r)})'
+            text += f' ({_bends(r)})' + _at_best(r)
         rows.append(_row(question, text, f'diagnosis_{name}_5d'))
     r = result(_SMALL)
     silent = sum(not row['names'] for row in r['rows'])
@@ -209,6 +209,21 @@ def _diagnosis() -> list[Row]:
         *healthy,
         _since_model(),
     ]  # fmt: skip
+
+
+def _at_best(r: dict[str, Any]) -> str:
+    """Return what was told where the true causes show, and the gain against that of the truth."""
+    best = r.get('visible_at_best')
+    if best is None:
+        return ''
+    share = best['share']
+    return (
+        f'; where each true cause gains at least 16 in log-likelihood beside the others, '
+        f'{best["right"]} of {best["records"]}, and in {best["wrong_but_as_likely"]} more another '
+        'answer is about as likely as the truth; on blocks kept out the named causes remove '
+        f'{share["median"]:.2f} (worst tenth {share["worst_tenth"]:.2f}) of what the true causes '
+        'remove'
+    )
 
 
 def _in_minutes() -> Row:
@@ -345,7 +360,7 @@ def measured() -> str:
 def results() -> str:
     """Return what a reader of the README asks first."""
     slope, knee = re.findall(r'error median (\S+) worst', _lines(_PAPER)['published'])[:2]
-    thermal = result('thermal_curves_minute_2001_2100')['summary']
+    thermal = result('thermal_curves_minute_2601_2700')['summary']
     errors = [thermal[kind]['error_mw'] for kind in _KIND_WORDS]
     medians = [e['median'] for e in errors]
     healthy, faulty = (result(name)['summary'] for name in (_HEALTHY, _FAULTY))
