@@ -169,6 +169,12 @@ def test_where_the_special_segments_do_not_tell_the_form_all_rows_do(seed):
     assert error_mw(simulation, curve) < 1.0
 
 
+@pytest.mark.long
+def test_a_breakpoint_that_only_long_means_show_is_found():
+    simulation = vf.simulate(8.0, 5105, unit='sequence:number=5105')
+    assert error_mw(simulation, vf.identify(simulation.log).characteristic) < 0.6  # 1.24 without
+
+
 def test_where_neither_decides_the_likelier_form_of_all_rows_is_taken():
     simulation = vf.simulate(8.0, 2335, unit='sequence:number=2335', recording='minute')
     curve = vf.identify(simulation.log).characteristic

@@ -56,7 +56,7 @@ class ChosenPieces:
     worth: dict[int, float]
 
 
-def _insert(model: RegionalModel, knot: float) -> RegionalModel:
+def insert(model: RegionalModel, knot: float) -> RegionalModel:
     """Add a knot without changing the curve."""
     k = int(np.clip(np.searchsorted(model.knots, knot) - 1, 0, model.pieces - 1))
     value = float(model.shape(np.array([knot]))[0])
@@ -97,7 +97,7 @@ def _best_knee(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[
         return float('nan'), 0.0
     dense = model
     for place in places:
-        dense = _insert(dense, float(place))
+        dense = insert(dense, float(place))
     _, hats, _ = problem.tangents(dense)
     hats = hats[:, : dense.pieces + 1]
     hinges = product(
@@ -161,7 +161,7 @@ def _grown(
         worth[model.pieces + 1] = gain
         if gain < KNEE_GAIN:
             break
-        trial = _insert(model, place)
+        trial = insert(model, place)
         trial, _ = move(problem, trial, ar, free_parameters(trial), 8)
         worth[model.pieces + 1] = gain = min(gain, problem.gain(model, trial, ar))
         if gain < KNEE_GAIN:
@@ -198,7 +198,7 @@ def _split(problem: Problem, model: RegionalModel, ar: FloatArray) -> tuple[Regi
     """
     best, most = model, -math.inf
     for place in 0.5 * (model.knots[:-1] + model.knots[1:]):
-        trial = _insert(model, float(place))
+        trial = insert(model, float(place))
         trial, _ = move(problem, trial, ar, free_parameters(trial), 12)
         gain = problem.gain(model, trial, ar)
         if gain > most:

@@ -27,6 +27,7 @@ from valveflow_ros.fit.piece_selection import (
     choose_pieces,
     confidence,
     find_jumps,
+    insert,
     shifted,
     supported_jumps,
 )
@@ -259,6 +260,7 @@ _NARROWEST = 0.01  # of the range of u: narrower pieces are joined before the se
 # of F is not F of the mean: there long means are always used. Of the intervals of breakpoints of
 # plants 36000 to 36029 of `--recording minute`, 94 % contain the truth then, and 79 % without.
 _LONG_S, _LONG_GAIN = 600.0, 15.0
+_LONG_KNEE_GAIN = 50.0  # log-likelihood of a further breakpoint in long means
 _LONG_LEAST_S = 150.0  # in short or interrupted records; shorter means contain fast movements
 _LONG_LEAST_MW = 0.03  # the averaged rows are not more exact than this
 _LONG_EACH = 10  # at least so many innovations for each parameter,
@@ -378,6 +380,9 @@ def refine(
             moved, samples = moved + by, samples.with_exponent(by)
             problem, fine = Problem(samples), Problem(samples.finer())
         model = _fitted_to(long, model, free)
+        if most_pieces is not None and not jumps.any():
+            model = _with_more_pieces(long, model, most_pieces)
+            free = free_parameters(model)
     found = _conclude(problem, fine, model, free, ar, fitted, long)
     return replace(
         found, confidence=shifted(likely, model.pieces - searched), exponent_moved=moved
@@ -414,6 +419,23 @@ def _fitted_to(long: Samples, model: RegionalModel, free: BoolArray) -> Regional
     problem = Problem(long)
     for _ in range(2):
         model, _ = move(problem, model, fit_ar(*problem.answer(model)), _of_curve(model, free), 3)
+    return model
+
+
+def _with_more_pieces(long: Samples, model: RegionalModel, most: int) -> RegionalModel:
+    """Add breakpoints that long means show clearly and fast movements did not; no jumps."""
+    problem = Problem(long)
+    ar = fit_ar(*problem.answer(model))
+    while model.pieces < most:
+        trials = []
+        for place in 0.5 * (model.knots[:-1] + model.knots[1:]):
+            trial = insert(model, float(place))
+            curve = _of_curve(trial, free_parameters(trial))
+            trials.append(move(problem, trial, ar, curve, 12)[0])
+        best = min(trials, key=lambda m: problem.cost(m, ar))
+        if problem.gain(model, best, ar) < _LONG_KNEE_GAIN:
+            break
+        model = best
     return model
 
 
