@@ -178,7 +178,7 @@ def _diagnosis() -> list[Row]:
         ('confounded_47300_47303', 'two causes that look alike'),
         ('pair_46000_46005', 'two causes at once: both named'),
         ('triple_46100_46105', 'three causes at once: all named'),
-        ('outside_47400_47402', 'effects outside the catalogue: none named'),
+        ('outside_33000_33002', 'effects outside the catalogue: none named'),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
         text = f'{r["right"]} of {r["records"]}'
