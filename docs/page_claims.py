@@ -216,13 +216,9 @@ def _at_best(r: dict[str, Any]) -> str:
     best = r.get('visible_at_best')
     if best is None:
         return ''
-    share = best['share']
     return (
-        f'; where each true cause gains at least 16 in log-likelihood beside the others, '
-        f'{best["right"]} of {best["records"]}, and in {best["wrong_but_as_likely"]} more another '
-        'answer is about as likely as the truth; on blocks kept out the named causes remove '
-        f'{share["median"]:.2f} (worst tenth {share["worst_tenth"]:.2f}) of what the true causes '
-        'remove'
+        f'; where each true cause gains at least 16 in log-likelihood beside the others: '
+        f'{best["right"]} of {best["records"]}'
     )
 
 

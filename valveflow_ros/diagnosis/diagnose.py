@@ -340,7 +340,7 @@ def diagnose(
     grids, rough = record.grids(bad), record.grids(bad, rough=True)
     _moves(grids)
     task = Task(grids, grids.open_rows, np.zeros(ORDER), given)
-    since = since_model(task, model) if given else ''
+    since = first = since_model(task, model) if given else ''
     start = since.changed if isinstance(since, Change) else None
     start = start or Extended(model if given else simplified(model))
     found = search(task, start, progress, rough, earlier_curve=given)
@@ -361,6 +361,8 @@ def diagnose(
     rest = _withdraw(found, rest)
     _withdraw_small(found)  # what a withdrawn cause left to another one may be less
     _, dropped = _verdict(found, rest, record_wrong=False)
+    if _BEND not in found.model.names or dropped:
+        since = first  # what was left beside a bend holds only beside it
     if given and found.model.active and not dropped:
         # Their mean effect on the record hides or imitates a change before it.
         since = since_model(task, model, found.model.active)
@@ -689,7 +691,8 @@ def _conclude(
     causes = tuple(
         NamedCause(
             a.name, sentences[a.name], estimates[a.name], gain,
-            a.cause.experiment, found.near.get(a.name, ()), a.extra,
+            a.cause.experiment,
+            tuple(n for n in found.near.get(a.name, ()) if n not in final.names), a.extra,
             _meaning(task, final, a),
         )
         for a, gain in zip(final.active, gains, strict=True)

@@ -481,9 +481,15 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
         part = SearchResult(found.task, without, found.plain, rough=found.rough)
         others = set(causes_for(found.task.grids)) - near - {a.name}
         rivals = _visible(part, _rivals(part, others), set())
-        if not rivals or rivals[0].added.name == a.name or rivals[0].added.beyond:
+        best = next((r for r in rivals if not _doubt(found.task, r)), None)
+        if best is None or best.added.name == a.name:
             continue
-        best = rivals[0]
+        # The present model may fit better than a new start of the same cause.
+        cost = found.task.cost(best.model)
+        variance = cost / max(int(found.task.rows.sum()), 1)
+        gain = (found.task.cost(found.model) - cost) / (2.0 * variance)
+        if gain <= PENALTY * (best.added.size - a.size):
+            continue
         evidence = weigh(found.task, without, best.model, best.added.size)
         if not evidence.enough:
             continue
@@ -493,10 +499,17 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
         found.reasons.pop(name, None)
         found.evidence[name] = evidence
         found.near[name] = tuple(
-            r.added.name for r in rivals[1:] if r.score - best.score < NOT_TOLD_APART
+            r.added.name for r in rivals if r is not best and r.score - best.score < NOT_TOLD_APART
         )
         found.reasons[a.name] = f'{name} explains the data better beside the causes found later'
         _take(found, best, evidence.gain)
+
+
+def _doubt(task: Task, rival: Rival) -> str:
+    """Return why a rival cannot take the place of a cause; or ''."""
+    if rival.added.cause.of_model and not task.fixed_dynamics:
+        return 'it is already included in the fitted curve and dynamics'
+    return rival.added.beyond or _without_onset(task, rival) or _small(task, rival)
 
 
 def _drop_weak(found: SearchResult, barred: set[str]) -> None:

@@ -178,7 +178,8 @@ def find_form(
         # The exponent is not determined: use that of ideal choked flow.
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
-    paper_at_end = not given and min(abs(paper.form.exponent - end) for end in within) < 1e-6
+    found_m = paper.form.exponent
+    paper_at_end = found_m != exponent and min(abs(found_m - end) for end in within) < 1e-6
     least_z = _DOUBTFUL_Z if paper_at_end else _LIKELIER_Z
     takes_scaled = gain > _LEAST_GAIN and sure > least_z
     if known is not None and known.scaled:

@@ -113,8 +113,10 @@ class Change:
     ----------
     name : str
         'gain_change', 'input_change', 'offset_change' or 'curve_change'.
-    given, changed : Extended
-        The given model, without and with the change, both with the causes found.
+    given : Extended
+        The given model as it is.
+    before, changed : Extended
+        It without and with the change, both with the drifts found, which count from the first row.
     parameters : dict
         By name, with 95 % intervals.
     sentence, meaning : str
@@ -124,6 +126,7 @@ class Change:
 
     name: str
     given: Extended
+    before: Extended
     changed: Extended
     parameters: dict[str, Estimate]
     sentence: str
@@ -139,8 +142,8 @@ class Change:
             With a newly fitted curve, which is used for a change of the curve.
         """
         # The causes found are judged after it.
-        after = plain if self.name == CURVE else self.changed.without_causes()
-        gain = sealed_gain(task, self.given.without_causes(), after, len(_KINDS) + 1)
+        pair = (self.given, plain) if self.name == CURVE else (self.before, self.changed)
+        gain = sealed_gain(task, *pair, len(_KINDS) + 1)
         experiment = _EXPERIMENT if self.near else ''
         return NamedCause(
             self.name, self.sentence, self.parameters, gain, experiment, self.near,
@@ -210,11 +213,11 @@ def since_model(
             f'Over the loads seen the record as a whole differs from the model given by '
             f'{size:.2g} MW (root mean square). {why}'
         )
-    after = base if change.name == CURVE else _KINDS[best].act(base, value)
+    before = Extended(given.base, tuple(a for a in named if a.name in _DRIFTS))
+    after = before.base if change.name == CURVE else _KINDS[best].act(before.base, value)
     return replace(
-        change, given=Extended(base, named),
-        changed=_levels_as_fit(task, Extended(base, named), after),
-    )  # fmt: skip
+        change, given=Extended(base), before=before, changed=_levels_as_fit(task, before, after)
+    )
 
 
 def _as_it_began(
@@ -317,7 +320,7 @@ def _change(
     meaning = f'At full load (from {full:.0f} MW on) this makes {more_or_less(by)}'
     meaning += where_largest(here, by, lambda rows: float(np.mean(moved[rows]))) + '.'
     return Change(
-        name, given, changed, {kind.parameter: Estimate(value, low, high, kind.unit)},
+        name, given, given, changed, {kind.parameter: Estimate(value, low, high, kind.unit)},
         sentence, meaning,
     )  # fmt: skip
 
@@ -339,7 +342,7 @@ def _curve_change(
         f'Since the model given was found the power at the same opening and pressure has changed, '
         f'{" and ".join(told)}; {_BEFORE}.'
     )
-    return Change(CURVE, given, given, parameters, sentence, near=near)
+    return Change(CURVE, given, given, given, parameters, sentence, near=near)
 
 
 def _at_load(fit: Regression, load: float, hats: FloatArray, least: float) -> tuple[float, float]:
