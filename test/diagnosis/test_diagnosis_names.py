@@ -23,6 +23,8 @@ from diagnosis_records import (
 from streams import needs_jit
 
 import valveflow_ros as vf
+from benchmarks.diagnosis_cases import hidden
+from benchmarks.diagnosis_study import record_of
 from valveflow_ros.diagnosis.diagnose import diagnose
 from valveflow_ros.errors import DataError
 from valveflow_ros.plant.unit import Noise, Programme
@@ -72,6 +74,19 @@ def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth, a
     if found_mw:
         signed = float(found_mw[1]) * (1.0 if found_mw[2] == 'more' else -1.0)
         assert signed == pytest.approx(at_full_load_mw, rel=0.2)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ('true', 'seed'),
+    # First another cause was chosen for the step; alone the exponent explains too little.
+    [(('temperature', 'gain_step'), 42104), (('exponent', 'input_step'), 42103)],
+)
+def test_two_causes_are_judged_beside_each_other(true, seed):
+    found = diagnose(*record_of(hidden(true, seed, 5.0, (2.0, 3.0)), 5.0))
+    assert {c.name for c in found.causes} == set(true)
+    for cause in found.causes:
+        assert not set(cause.not_told_apart) & set(true)
 
 
 @pytest.mark.long
