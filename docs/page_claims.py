@@ -170,7 +170,7 @@ def _diagnosis() -> list[Row]:
     rows = []
     for name, question in (
         (_HIDDEN, 'one hidden effect: named, and no other'),
-        (_NULL, 'nothing wrong: nothing named'),
+        (_NULL, 'nothing wrong: nothing named, and nothing said to be unexplained'),
         ('slow_47200_47204',
          'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
@@ -391,9 +391,10 @@ def results() -> str:
          f'one in {found} of {tried} runs, still active on day 20 in {stood}'),
         ("plants of the paper's kind, five days: healthy, and with one hidden effect of 2 to 3 "
          'times the detection limit',
-         f'nothing named in {null["right"]} of {null["records"]}; the effect named, and no '
-         f'other, in {hidden["right"]} of {hidden["records"]} ({_bends(hidden)}), another name '
-         f'with confidence in {hidden["named_with_confidence_wrongly"]} of these'),
+         f'nothing named in {sum(not r["names"] for r in null["rows"])} of {null["records"]}; '
+         f'the effect named, and no other, in {hidden["right"]} of {hidden["records"]} '
+         f'({_bends(hidden)}), another name with '
+         f'confidence in {hidden["named_with_confidence_wrongly"]} of these'),
         ('units built from physics, with an effect or healthy: [a benchmark](docs/naming.md)',
          f'right answers in {_total(named, "right")} of {_total(named, "records")}, a wrong or '
          f'further name in {_total(named, "wrong")}'),

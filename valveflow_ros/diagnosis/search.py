@@ -266,10 +266,7 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
     for rival in rivals:
         if best is not None and rival.score - best > NOT_TOLD_APART:
             break
-        doubt = (
-            rival.added.beyond or _without_onset(found.task, rival) or _small(found.task, rival)
-        )
-        if doubt:
+        if doubt := _doubt(found.task, rival):
             # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
             continue
@@ -484,6 +481,8 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
         best = next((r for r in rivals if not _doubt(found.task, r)), None)
         if best is None or best.added.name == a.name:
             continue
+        if best.added.cause.of_model and not found.task.fixed_dynamics:
+            continue  # no fault: the fitted dynamics include it
         # The present model may fit better than a new start of the same cause.
         cost = found.task.cost(best.model)
         variance = cost / max(int(found.task.rows.sum()), 1)
@@ -506,9 +505,7 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
 
 
 def _doubt(task: Task, rival: Rival) -> str:
-    """Return why a rival cannot take the place of a cause; or ''."""
-    if rival.added.cause.of_model and not task.fixed_dynamics:
-        return 'it is already included in the fitted curve and dynamics'
+    """Return why a rival is no candidate, however well it fits; or ''."""
     return rival.added.beyond or _without_onset(task, rival) or _small(task, rival)
 
 

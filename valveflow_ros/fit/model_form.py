@@ -173,15 +173,12 @@ def find_form(
     elif axis == OPENING:
         held = scaled.form
     gain, sure, told = _told(means, scaled, paper)
-    at_end = min(abs(scaled.form.exponent - end) for end in within) < 1e-6
-    if held is None and moves and (at_end or not told):
+    if held is None and moves and (_at_end(scaled, within) or not told):
         # The exponent is not determined: use that of ideal choked flow.
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
-    found_m = paper.form.exponent
-    paper_at_end = found_m != exponent and min(abs(found_m - end) for end in within) < 1e-6
-    least_z = _DOUBTFUL_Z if paper_at_end else _LIKELIER_Z
-    takes_scaled = gain > _LEAST_GAIN and sure > least_z
+    doubtful = paper.form.exponent != exponent and _at_end(paper, within)
+    takes_scaled = gain > _LEAST_GAIN and sure > (_DOUBTFUL_Z if doubtful else _LIKELIER_Z)
     if known is not None and known.scaled:
         takes_scaled = not _told(means, paper, scaled)[2]
     if held is not None:
@@ -204,6 +201,11 @@ def find_form(
     )
     offset = _offset(means, chosen) if chosen.form.scaled else 0.0
     return FoundForm(chosen.form, offset, evidence, given or not (told and moves))
+
+
+def _at_end(fit: _Fit, within: tuple[float, float]) -> bool:
+    """Return True if the exponent of a fit is at an end of its range."""
+    return min(abs(fit.form.exponent - end) for end in within) < 1e-6
 
 
 @dataclass(frozen=True, slots=True)
