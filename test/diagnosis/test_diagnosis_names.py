@@ -78,12 +78,24 @@ def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth, a
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ('true', 'seed'),
-    # First another cause was chosen for the step; alone the exponent explains too little.
-    [(('temperature', 'gain_step'), 42104), (('exponent', 'input_step'), 42103)],
+    ('true', 'seed', 'days'),
+    [
+        # First another cause was chosen for the step; alone the exponent explains too little.
+        (('temperature', 'gain_step'), 42104, 5.0),
+        (('exponent', 'input_step'), 42103, 5.0),
+        # Before the temperature was known, the step had an onset ten hours before the true one.
+        (('temperature', 'gain_step'), 48000, 10.0),
+        # The fitted curve moves a breakpoint towards the bend; a step was chosen for the drift.
+        (('curve_shape', 'gain_drift'), 46001, 5.0),
+        # Intervals imitate a step and a daily cycle.
+        (('temperature', 'gain_step', 'diurnal'), 46104, 5.0),
+        # Their states in blocks that no fit may use looked like a slow disturbance.
+        (('intervals',), 48201, 10.0),
+    ],
 )
-def test_two_causes_are_judged_beside_each_other(true, seed):
-    found = diagnose(*record_of(hidden(true, seed, 5.0, (2.0, 3.0)), 5.0))
+def test_causes_are_judged_beside_each_other(true, seed, days):
+    case = hidden(true, seed, days, (2.0, 3.0))
+    found = diagnose(*record_of(case, days), case.given)
     assert {c.name for c in found.causes} == set(true)
     for cause in found.causes:
         assert not set(cause.not_told_apart) & set(true)

@@ -50,6 +50,7 @@ from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import (
     Progress,
     SearchResult,
+    add_of_family,
     search,
     simplified,
 )
@@ -457,14 +458,18 @@ def _course(found: SearchResult) -> Course | None:
     tried = courses(found.task, found.model, names)
     if not tried:
         return None
-    best = max(tried.values(), key=lambda c: c.score)
+    mine: tuple[str, ...] = ()
     if names:
         families = tuple(sorted(catalogue()[name].family for name in names))
-        mine = [tried[shape] for shape in (NAMED_SHAPE, *_SHAPES.get(families, ()))]
+        mine = (NAMED_SHAPE, *_SHAPES.get(families, ()))
+    best = max((c for c in tried.values() if c.name not in mine), key=lambda c: c.score)
+    if names:
         if 'intervals' in names and best.name == NO_SHAPE:
             return None  # every switching time costs a parameter; a disturbance needs none for it
         least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
-        if best.score - max(c.score for c in mine) <= least:
+        if len(names) > 1 and 'intervals' in names:
+            least = -_ANOTHER_SHAPE  # they can begin or end where another cause does
+        if best.score - max(tried[shape].score for shape in mine) <= least:
             return None
         for name in names:
             found.model = found.model.without(name)
@@ -472,6 +477,11 @@ def _course(found: SearchResult) -> Course | None:
             found.near.pop(name, None)
             found.reasons[name] = _OF_SHAPE[best.name]
         found.model, _ = improve(found.task, found.model, 3)
+        if best.name not in families and add_of_family(found, best.name):
+            # The causes of another family hid those of this shape.
+            confirm(found)
+            found.model = _dated(found)
+            return _course(found)
     least_mw = LEAST_DRIFT_MW * found.task.grids.size
     if best.score - tried[NO_SHAPE].score < _LEAST_SHAPE or best.rms_mw <= least_mw:
         return None
@@ -524,14 +534,15 @@ _DAYS_FROM_H = 48.0
 
 
 def _dated(found: SearchResult) -> Extended:
-    """Return the model with its onsets fitted to all blocks.
+    """Return the model with its onsets and hidden states fitted to all blocks.
 
     The open blocks alone would place a change inside a sealed block at the wrong end of it. The
     hours between that and the true time would look like a misfit or a slow disturbance. Only the
-    time of a change is taken from the sealed blocks.
+    times of changes are taken from the sealed blocks.
     """
     every = replace(found.task, rows=found.task.grids.whole)
-    return search_onsets(every, found.model)
+    everywhere = np.ones(every.grids.subs, dtype=bool)
+    return inferred(every, search_onsets(every, found.model), everywhere)
 
 
 def _own_misfit(found: SearchResult, left: Structure) -> str:

@@ -81,9 +81,12 @@ def _believed(
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals and weights of all realisations, both (k, m)."""
     rest = np.empty((a.cause.draws, len(grids.power)))
-    for k in range(a.cause.draws):
+
+    def work(k: int) -> None:
         one = replace(model, active=tuple(_single(b, k) if b is a else b for b in model.active))
         rest[k] = np.where(grids.scored, grids.power - answer(grids, one), 0.0)
+
+    run_in_threads(work, [(k,) for k in range(a.cause.draws)], cores())
     white = rest.copy()
     for lag, factor in enumerate(ar, start=1):
         white[:, lag:] -= factor * rest[:, :-lag]

@@ -25,7 +25,7 @@ from valveflow_ros.diagnosis.fitting import (
 )
 from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
-from valveflow_ros.errors import TooFewSamplesError
+from valveflow_ros.errors import TooFewSamplesError, listed
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
 from valveflow_ros.records import FloatArray
@@ -141,8 +141,11 @@ NOT_TOLD_APART = 10.0
 # physics with numbers 5001 to 5012.
 _LEAST_HEIGHT = 0.0025
 KEPT_LEAST = 8.0
+_LEAST_EXCHANGE = 1.0  # log-likelihood: less is no reason to fit everything again
 STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
 _SHORT_STEPS_MW = (1.0, 0.4)
+_INTERVALS = 'intervals'
+_BEND, _BENDS = 'curve_shape', 2  # so many of the starts of a bend are refitted to the end
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +167,8 @@ class SearchResult:
         The last whitening and the model with all causes.
     plain : Extended
         The model without causes, fitted to the same rows.
+    start : Extended
+        The model from which the search began.
     evidence : dict
         By name of a cause, its evidence when it was added.
     near : dict
@@ -179,6 +184,7 @@ class SearchResult:
     task: Task
     model: Extended
     plain: Extended
+    start: Extended
     evidence: dict[str, Evidence] = field(default_factory=dict)
     near: dict[str, tuple[str, ...]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
@@ -199,7 +205,7 @@ def search(
     """
     progress(0.05, 'simulation fitted to the record')
     task, plain = _settled(task, start)
-    found = SearchResult(task, plain, plain, rough=rough)
+    found = SearchResult(task, plain, plain, start, rough=rough)
     barred: set[str] = set()
     every = causes_for(task.grids)
     for name, cause in every.items():
@@ -222,13 +228,7 @@ def search(
         )
         barred.add('curve_shape')
     found.tried = len(every) - len(barred)
-    for turn in range(MOST_CAUSES):
-        progress(0.15 + 0.15 * turn, 'causes tried' if turn == 0 else 'further causes tried')
-        if not _add(found, barred):
-            break
-        _drop_weak(found, barred)
-        _exchange(found, barred)
-        _conceal(found, barred)
+    found = _extended(found, barred, progress)
     for name in catalogue():
         if (why := unseen(name, task.grids)) and name not in found.model.names:
             found.reasons.setdefault(name, why)
@@ -236,6 +236,55 @@ def search(
         if name not in found.model.names:
             found.reasons.setdefault(name, _BY_CHANCE)
     return found
+
+
+def _extended(found: SearchResult, barred: set[str], progress: Progress) -> SearchResult:
+    """Add causes while one of them passes the tests.
+
+    Intervals at unknown times can imitate several causes at once. When they are added, these are
+    also searched for without them, and the likelier set is returned.
+    """
+    for turn in range(len(found.model.active), MOST_CAUSES):
+        progress(0.15 + 0.15 * turn, 'further causes tried' if turn else 'causes tried')
+        before = replace(
+            found, evidence=dict(found.evidence), near=dict(found.near),
+            reasons=dict(found.reasons),
+        )  # fmt: skip
+        barred_before = {*barred, _INTERVALS}
+        if not _add(found, barred):
+            break
+        _drop_weak(found, barred)
+        _exchange(found, barred)
+        _conceal(found, barred)
+        if _INTERVALS in found.model.names and _INTERVALS not in before.model.names:
+            others = _extended(before, barred_before, progress)
+            return _likelier(_extended(found, barred, progress), others)
+    return found
+
+
+def _likelier(found: SearchResult, others: SearchResult) -> SearchResult:
+    """Return the likelier of two searches, the first of which found intervals."""
+    if _INTERVALS not in found.model.names:
+        return found
+    task = others.task  # both with the same whitening and variance
+    e = task.innovations(task.residual(others.model))
+    variance = float(e @ e) / len(e) * colour(task, e)
+
+    def score(model: Extended) -> float:
+        chosen = PENALTY * sum(a.size for a in model.active) + _EACH * model.base.size
+        return task.cost(model) / (2.0 * variance) + chosen
+
+    less = score(found.model) - score(others.model)
+    if less <= 0.0:
+        return found
+    instead = [n for n in others.model.names if n not in found.model.names]
+    others.reasons[_INTERVALS] = (
+        f'{listed(instead)} {"together explain" if len(instead) > 1 else "explains"} the data '
+        f'better (log-likelihood {less:+.1f})'
+    )
+    for name in instead if less < NOT_TOLD_APART else ():
+        others.near[name] = (*others.near[name], _INTERVALS)
+    return others
 
 
 def _settled(task: Task, start: Extended) -> tuple[Task, Extended]:
@@ -276,25 +325,32 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
         if not evidence.enough:
             found.reasons[rival.added.name] = evidence.reason()
             continue
-        name = rival.added.name
-        found.reasons.pop(name, None)
-        found.evidence[name] = evidence
-        found.near[name] = tuple(
-            r.added.name for r in rivals
-            if r is not rival and r.score - rival.score < NOT_TOLD_APART
-        )  # fmt: skip
-        for other in rivals:
-            if other is not rival:
-                by = other.score - rival.score
-                found.reasons[other.added.name] = (
-                    f'{name} explains the data better (log-likelihood {by:+.1f})'
-                )
+        _note(found, rival, rivals, evidence)
         if rival.added.cause.of_model and not found.task.fixed_dynamics:
             _absorb(found, rival)
         else:
             _take(found, rival, evidence.gain)
         return True
     return False
+
+
+def _note(found: SearchResult, chosen: Rival, rivals: list[Rival], evidence: Evidence) -> None:
+    """Write down why a cause was added, and how much better it is than its rivals."""
+    name, behind = chosen.added.name, {r.added.name: r.score - chosen.score for r in rivals}
+    del behind[name]
+    found.reasons.pop(name, None)
+    found.evidence[name] = evidence
+    found.near[name] = tuple(n for n, by in behind.items() if by < NOT_TOLD_APART)
+    for other, by in behind.items():
+        found.reasons[other] = f'{name} explains the data better (log-likelihood {by:+.1f})'
+
+
+def add_of_family(found: SearchResult, family: str) -> bool:
+    """Add the best cause of one family if it passes the tests; return True if it did."""
+    causes = causes_for(found.task.grids)
+    others = {name for name, cause in causes.items() if cause.family != family}
+    hindered = {name for name, cause in causes.items() if cause.hindered(found.task.grids)}
+    return _add(found, others | hindered)
 
 
 def _without_onset(task: Task, rival: Rival) -> str:
@@ -386,17 +442,21 @@ def _absorb(found: SearchResult, rival: Rival) -> None:
     found.plain, _ = improve(found.task, plain, 4)
 
 
-def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]]:
+def _shortlist(found: SearchResult, barred: set[str]) -> list[tuple[str, Start]]:
     """Return starts to be refitted: the best ones, and the families of the best ones.
 
-    Backlash and stiction are two models of one slack: there is one of them only.
+    Backlash and stiction are two models of one slack: there is one of them only. The fitted curve
+    has moved its breakpoints towards a bend, so a bend is searched for on the curve before.
     """
+    screening = Screening(found.task, found.model, found.rough)
+    before = replace(found.model, base=found.start.base)
     every = causes_for(screening.task.grids)
     single = {a.cause.family for a in screening.model.active} & {'slack'}
     starts: dict[str, list[Start]] = {}
     for name, cause in every.items():
         if not (name in barred or name in screening.model.names or cause.family in single):
-            starts[name] = list(cause.starts(screening))
+            on = Screening(found.task, before, found.rough) if name == _BEND else screening
+            starts[name] = list(cause.starts(on))
     best = {n: max(s.gain for s in found) for n, found in starts.items() if found}
     if not best or max(best.values()) < SCREEN_LEAST:
         return []
@@ -409,19 +469,21 @@ def _shortlist(screening: Screening, barred: set[str]) -> list[tuple[str, Start]
 
 def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
     """Refit every promising cause; return one candidate per cause, best score first."""
-    screening = Screening(found.task, found.model, found.rough)
-    shortlist = _shortlist(screening, barred)
+    shortlist = _shortlist(found, barred)
     every = causes_for(found.task.grids)
     tangents = None
     if shortlist:
         tangents = found.task.innovations(base_tangents(found.task, found.model))
-    refits = []
+    refits, bends = [], []
     for name, start in shortlist:
         added = FittedCause(every[name], start.values, start.extra)
-        model, frozen = found.model, tangents
-        if start.base is not None:
-            model, frozen = replace(model, base=start.base), None
-        refits.append(_refit(found.task, model.with_cause(added), frozen))
+        if start.base is None:
+            refits.append(_refit(found.task, found.model.with_cause(added), tangents))
+        else:
+            model = replace(found.model, base=start.base).with_cause(added)
+            bends.append(improve(found.task, model, 2))
+    for model, _ in sorted(bends, key=lambda b: b[1])[:_BENDS]:
+        refits.append(_refit(found.task, model, None))
     if not refits:
         return []
     # The noise variance is that of the best refit.
@@ -468,18 +530,19 @@ def _refit(task: Task, model: Extended, tangents: FloatArray | None) -> tuple[Ex
 def _exchange(found: SearchResult, barred: set[str]) -> None:
     """Replace each earlier cause by one that was nearly as good, if that one is better now.
 
-    While the later causes were missing, the wrong one may have taken a part of their effect.
+    While the later causes were missing, the wrong one may have taken a part of their effect, or
+    the right one may have got a wrong onset.
     """
     for a in found.model.active[:-1]:
         near = {n for n in found.near.get(a.name, ()) if n not in {*barred, *found.model.names}}
-        if not near:
+        if not (near or any(u.dated for u in a.cause.unknowns)):
             continue
         without, _ = improve(found.task, found.model.without(a.name), 3)
-        part = SearchResult(found.task, without, found.plain, rough=found.rough)
+        part = SearchResult(found.task, without, found.plain, found.start, rough=found.rough)
         others = set(causes_for(found.task.grids)) - near - {a.name}
         rivals = _visible(part, _rivals(part, others), set())
         best = next((r for r in rivals if not _doubt(found.task, r)), None)
-        if best is None or best.added.name == a.name:
+        if best is None:
             continue
         if best.added.cause.of_model and not found.task.fixed_dynamics:
             continue  # no fault: the fitted dynamics include it
@@ -487,20 +550,18 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
         cost = found.task.cost(best.model)
         variance = cost / max(int(found.task.rows.sum()), 1)
         gain = (found.task.cost(found.model) - cost) / (2.0 * variance)
-        if gain <= PENALTY * (best.added.size - a.size):
+        if gain <= PENALTY * (best.added.size - a.size) + _LEAST_EXCHANGE:
             continue
         evidence = weigh(found.task, without, best.model, best.added.size)
         if not evidence.enough:
             continue
-        name = best.added.name
         found.evidence.pop(a.name, None)
         found.near.pop(a.name, None)
-        found.reasons.pop(name, None)
-        found.evidence[name] = evidence
-        found.near[name] = tuple(
-            r.added.name for r in rivals if r is not best and r.score - best.score < NOT_TOLD_APART
-        )
-        found.reasons[a.name] = f'{name} explains the data better beside the causes found later'
+        _note(found, best, rivals, evidence)
+        if best.added.name != a.name:
+            found.reasons[a.name] = (
+                f'{best.added.name} explains the data better beside the causes found later'
+            )
         _take(found, best, evidence.gain)
 
 
@@ -510,19 +571,32 @@ def _doubt(task: Task, rival: Rival) -> str:
 
 
 def _drop_weak(found: SearchResult, barred: set[str]) -> None:
-    """Remove each earlier cause that the later ones have made superfluous."""
+    """Remove each earlier cause that the newest has made superfluous, or the newest in its place.
+
+    While the onset of the earlier one was wrong, a newer one with more parameters may have taken
+    its part.
+    """
     for a in found.model.active[:-1]:
         if len(found.model.active) < 2:
             return
+        newest = found.model.active[-1]
         cost = found.task.cost(found.model)
         variance = cost / max(int(found.task.rows.sum()), 1)
-        smaller, without = improve(found.task, found.model.without(a.name), 3)
-        loss = (without - cost) / (2.0 * variance)
-        if loss < KEPT_LEAST + a.size:
-            found.model = replace(smaller)
-            found.evidence.pop(a.name, None)
-            found.near.pop(a.name, None)
-            found.reasons[a.name] = (
-                f'after the causes found later it gains only {loss:.1f} in log-likelihood'
-            )
-            barred.add(a.name)
+        without, more = _refit(found.task, found.model.without(a.name), None)
+        loss = (more - cost) / (2.0 * variance)
+        if loss >= KEPT_LEAST + a.size:
+            continue
+        name, than = a.name, 'the causes found later'
+        if newest.size > a.size:
+            other, other_more = _refit(found.task, found.model.without(newest.name), None)
+            saved = PENALTY * (newest.size - a.size)
+            if other_more - more < 2.0 * variance * saved:
+                without, loss = other, (other_more - cost) / (2.0 * variance)
+                name, than = newest.name, f'{a.name}, which is simpler,'
+        found.model = without
+        found.evidence.pop(name, None)
+        found.near.pop(name, None)
+        found.reasons[name] = f'after {than} it gains only {loss:.1f} in log-likelihood'
+        barred.add(name)
+        if name == newest.name:
+            return

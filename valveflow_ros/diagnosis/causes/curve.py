@@ -29,6 +29,7 @@ from valveflow_ros.diagnosis.screening import CURVE, HATS, Screening
 from valveflow_ros.records import FloatArray
 
 _KEPT = 3
+_HEIGHTS = (1.0, 2.0)
 _WIDTHS = (0.06, 0.1, 0.16, 0.25)  # of the range of u
 
 
@@ -47,19 +48,36 @@ def apply_curve_shape(u: FloatArray, values: Values, grids: Grids) -> FloatArray
 
 
 def curve_shape_starts(screening: Screening) -> Sequence[Start]:
-    """Try bumps of several widths along the curve; keep the best positions and widths."""
+    """Try bumps of several widths along the curve; keep the best places that are far apart.
+
+    Each begins with the height of the regression and with twice as much, because the breakpoints
+    take up a part of a bump, and with its regions at the same MW or at the same u.
+    """
     low, high = screening.hats[0], screening.hats[-1]
-    found: list[Start] = []
+    tried: list[Start] = []
     for share in _WIDTHS:
         width = share * (high - low)
         places = np.arange(low + 0.5 * width, high, 0.8 * width)
-        tried = [
+        tried += [
             screening.scaled_height(CURVE_SHAPE, (float(u), float(width))) for u in places.tolist()
         ]
-        found.append(max(tried, key=lambda s: s.gain))
-    best = sorted(found, key=lambda s: -s.gain)[:_KEPT]
+    best: list[Start] = []
+    for start in sorted(tried, key=lambda s: -s.gain):
+        if all(_apart(start.values, other.values) for other in best) and len(best) < _KEPT:
+            best.append(start)
     scale = float(np.median(screening.grids.scale))
-    return [replace(s, base=_levels_under(screening.model.base, s.values, scale)) for s in best]
+    base, out = screening.model.base, []
+    for start, factor in itertools.product(best, _HEIGHTS):
+        values = (factor * start.values[0], *start.values[1:])
+        lifted = _levels_under(base, values, scale)
+        bases = (base,) if lifted is base else (base, lifted)
+        out += [replace(start, values=values, base=b) for b in bases]
+    return out
+
+
+def _apart(one: Values, other: Values) -> bool:
+    """Return True if the centres of two bumps are further apart than half their widths."""
+    return abs(one[1] - other[1]) > 0.5 * max(one[2], other[2])
 
 
 def _levels_under(base: RegionalModel, values: Values, scale: float) -> RegionalModel:
