@@ -316,6 +316,13 @@ class FittedCause:
         return {u.name: v for u, v in zip(self.cause.unknowns, self.values, strict=True)}
 
     @property
+    def changes_h(self) -> tuple[float, ...]:
+        """Return when it begins or changes, in hours since the first row."""
+        pairs = zip(self.cause.unknowns, self.values, strict=True)
+        onsets = tuple(24.0 * v for u, v in pairs if u.dated)
+        return (*onsets, *(s / 3600.0 for s in self.extra))
+
+    @property
     def beyond(self) -> str:
         """Return a sentence about a value near its upper bound; empty if there is none."""
         for unknown, value in zip(self.cause.unknowns, self.values, strict=True):

@@ -467,8 +467,6 @@ def _course(found: SearchResult) -> Course | None:
         if 'intervals' in names and best.name == NO_SHAPE:
             return None  # every switching time costs a parameter; a disturbance needs none for it
         least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
-        if len(names) > 1 and 'intervals' in names:
-            least = -_ANOTHER_SHAPE  # they can begin or end where another cause does
         if best.score - max(tried[shape].score for shape in mine) <= least:
             return None
         for name in names:

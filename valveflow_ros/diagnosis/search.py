@@ -238,11 +238,18 @@ def search(
     return found
 
 
-def _extended(found: SearchResult, barred: set[str], progress: Progress) -> SearchResult:
+def _extended(
+    found: SearchResult, barred: set[str], progress: Progress, pairs: bool = False
+) -> SearchResult:
     """Add causes while one of them passes the tests.
 
     Intervals at unknown times can imitate several causes at once. When they are added, these are
     also searched for without them, and the likelier set is returned.
+
+    Parameters
+    ----------
+    pairs : bool
+        If no cause passes alone, two are tried at once: each may hide the other.
     """
     for turn in range(len(found.model.active), MOST_CAUSES):
         progress(0.15 + 0.15 * turn, 'further causes tried' if turn else 'causes tried')
@@ -251,13 +258,13 @@ def _extended(found: SearchResult, barred: set[str], progress: Progress) -> Sear
             reasons=dict(found.reasons),
         )  # fmt: skip
         barred_before = {*barred, _INTERVALS}
-        if not _add(found, barred):
+        if not (_add(found, barred) or (pairs and _add_two(found, barred))):
             break
         _drop_weak(found, barred)
         _exchange(found, barred)
         _conceal(found, barred)
         if _INTERVALS in found.model.names and _INTERVALS not in before.model.names:
-            others = _extended(before, barred_before, progress)
+            others = _extended(before, barred_before, progress, pairs=True)
             return _likelier(_extended(found, barred, progress), others)
     return found
 
@@ -332,6 +339,28 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
             _take(found, rival, evidence.gain)
         return True
     return False
+
+
+def _add_two(found: SearchResult, barred: set[str]) -> bool:
+    """Add the two best causes if each passes the tests beside the other; return True if so."""
+    task, model, notes = found.task, found.model, []
+    for _ in range(2):
+        part = replace(found, model=model, reasons={})
+        rivals = _visible(part, _rivals(part, barred), set())
+        best = next((r for r in rivals if not _doubt(task, r)), None)
+        if best is None:
+            return False
+        model = best.model
+        notes.append((best, rivals))
+    for best, _ in notes:
+        without, _ = improve(task, model.without(best.added.name), 3)
+        evidence = weigh(task, without, model, best.added.size)
+        if not evidence.enough or best.added.cause.of_model:
+            return False
+    for best, rivals in notes:
+        _note(found, best, rivals, evidence)
+    _take(found, notes[-1][0], evidence.gain)
+    return True
 
 
 def _note(found: SearchResult, chosen: Rival, rivals: list[Rival], evidence: Evidence) -> None:
@@ -571,32 +600,19 @@ def _doubt(task: Task, rival: Rival) -> str:
 
 
 def _drop_weak(found: SearchResult, barred: set[str]) -> None:
-    """Remove each earlier cause that the newest has made superfluous, or the newest in its place.
-
-    While the onset of the earlier one was wrong, a newer one with more parameters may have taken
-    its part.
-    """
+    """Remove each earlier cause that the later ones have made superfluous."""
     for a in found.model.active[:-1]:
         if len(found.model.active) < 2:
             return
-        newest = found.model.active[-1]
         cost = found.task.cost(found.model)
         variance = cost / max(int(found.task.rows.sum()), 1)
-        without, more = _refit(found.task, found.model.without(a.name), None)
-        loss = (more - cost) / (2.0 * variance)
-        if loss >= KEPT_LEAST + a.size:
-            continue
-        name, than = a.name, 'the causes found later'
-        if newest.size > a.size:
-            other, other_more = _refit(found.task, found.model.without(newest.name), None)
-            saved = PENALTY * (newest.size - a.size)
-            if other_more - more < 2.0 * variance * saved:
-                without, loss = other, (other_more - cost) / (2.0 * variance)
-                name, than = newest.name, f'{a.name}, which is simpler,'
-        found.model = without
-        found.evidence.pop(name, None)
-        found.near.pop(name, None)
-        found.reasons[name] = f'after {than} it gains only {loss:.1f} in log-likelihood'
-        barred.add(name)
-        if name == newest.name:
-            return
+        smaller, without = improve(found.task, found.model.without(a.name), 3)
+        loss = (without - cost) / (2.0 * variance)
+        if loss < KEPT_LEAST + a.size:
+            found.model = replace(smaller)
+            found.evidence.pop(a.name, None)
+            found.near.pop(a.name, None)
+            found.reasons[a.name] = (
+                f'after the causes found later it gains only {loss:.1f} in log-likelihood'
+            )
+            barred.add(a.name)

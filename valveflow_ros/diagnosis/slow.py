@@ -315,7 +315,7 @@ PENALTY = 5.0  # log-likelihood that each parameter chosen from the data must ga
 _OF_WANDER = 2.0 * 2.0  # penalty for its variance and its time scale, which are found on a grid
 _MOMENTS = 96
 _EDGE = 0.04  # fraction of the record at each end without onsets
-_APART = 2  # least distance between two steps, in grid times
+_APART = 2  # least distance between two steps, in times of the grid
 _SPREADS_H = (0.0, 4.0)  # duration of a step; two steps have the same one
 _RATES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # time constants relative to the length of the record
 NO_SHAPE, NAMED_SHAPE = 'wander', 'named'
@@ -362,11 +362,17 @@ class _Shape:
     spread_s: float = 0.0
 
 
-def _shapes(found: Levels) -> list[_Shape]:
-    """Return every shape of one column; steps first, by duration and then time."""
+def _shapes(found: Levels, changes_h: Sequence[float]) -> list[_Shape]:
+    """Return every shape of one column; steps first, by duration and then time.
+
+    They begin at the times of a grid and at the given ones: shapes with coarser times than those
+    of the named causes would be at a disadvantage.
+    """
     t, load = found.hours, found.load
     span = float(t[-1] - t[0])
-    moments = np.linspace(t[0] + _EDGE * span, t[-1] - _EDGE * span, _MOMENTS)
+    low, high = t[0] + _EDGE * span, t[-1] - _EDGE * span
+    given = [h for h in changes_h if low < h < high]
+    moments = np.unique([*np.linspace(low, high, _MOMENTS), *given])
     even = (t - t[0]) / span
     after = t[:, None] >= moments
     steps = [
@@ -410,10 +416,11 @@ def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Cour
     found, _ = levels(task, without, task.grids.whole, careful=False)
     if not found.enough:
         return {}
-    single = _shapes(found)
+    named = [a for a in model.active if a.name in names]
+    single = _shapes(found, [h for a in named for h in a.changes_h])
     if names:
         full, _ = levels(task, model, task.grids.whole, careful=False)
-        numbers = sum(a.size for a in model.active if a.name in names)
+        numbers = sum(a.size for a in named)
         single.append(_Shape(NAMED_SHAPE, found.power - full.power, (), numbers))
     columns = np.column_stack([s.columns for s in single])
     best: dict[str, tuple[float, tuple[int, ...], FloatArray]] = {}
@@ -435,6 +442,9 @@ def _scored(
     kinds = np.array([s.name for s in single])
     paid = PENALTY * np.array([s.numbers for s in single])
     drift_at = int(np.flatnonzero(kinds == 'drift')[0])
+    all_spreads_s = np.array([s.spread_s for s in single])
+    spreads_s = dict.fromkeys(all_spreads_s[kinds == 'step'].tolist())
+    least_s = 3600.0 * _APART * float(np.ptp(found.hours)) * (1.0 - 2.0 * _EDGE) / (_MOMENTS - 1)
     for white, half, _, ratio in _wanders(found, table):
         basis, _ = np.linalg.qr(white[:, 1 : 1 + p])
         left = white - basis @ (basis.T @ white)
@@ -454,18 +464,19 @@ def _scored(
             mine = np.flatnonzero(kinds == name)
             j = int(mine[score[mine].argmax()])
             yield str(name), float(score[j]), (j,), toward[[j]] / size[j]
-        for steps in np.flatnonzero(kinds == 'step').reshape(-1, _MOMENTS):
-            spread_s = single[steps[0]].spread_s
+        for spread_s in spreads_s:
+            steps = np.flatnonzero((kinds == 'step') & (all_spreads_s == spread_s))
             more = PENALTY * (spread_s > 0.0)
-            between_s = single[steps[1]].at_s[0] - single[steps[0]].at_s[0]
-            # The second step begins after the first: their sizes are real changes of the power.
-            apart = max(_APART, math.ceil(spread_s / between_s))
-            gain, a, b = _pairs(gram, toward, np.full(_MOMENTS, drift_at), steps)
+            gain, a, b = _pairs(gram, toward, np.full(len(steps), drift_at), steps)
             j = int(gain.argmax())
             chosen = drift_at, int(steps[j])
             score = worth(gain) - 3 * PENALTY - more
             yield 'drift and step', float(score[j]), chosen, np.array([a[j], b[j]])
-            one, two = steps[0] + np.array(np.triu_indices(_MOMENTS, apart))
+            # The second step begins after the first: their sizes are real changes of the power.
+            at_s = np.array([single[j].at_s[0] for j in steps])
+            one, two = steps[0] + np.array(np.triu_indices(len(steps), 1))
+            apart = at_s[two - steps[0]] - at_s[one - steps[0]] >= max(least_s, spread_s)
+            one, two = one[apart], two[apart]
             gain, a, b = _pairs(gram, toward, one, two)
             j = int(gain.argmax())
             chosen = int(one[j]), int(two[j])
