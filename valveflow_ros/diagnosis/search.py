@@ -285,9 +285,10 @@ def _likelier(found: SearchResult, others: SearchResult) -> SearchResult:
     if less <= 0.0:
         return found
     instead = [n for n in others.model.names if n not in found.model.names]
+    better = 'together explain' if len(instead) > 1 else 'explains'
     others.reasons[_INTERVALS] = (
-        f'{listed(instead)} {"together explain" if len(instead) > 1 else "explains"} the data '
-        f'better (log-likelihood {less:+.1f})'
+        f'{listed(instead) or "a model without it"} {better} the data better '
+        f'(log-likelihood {less:+.1f})'
     )
     for name in instead if less < NOT_TOLD_APART else ():
         others.near[name] = (*others.near[name], _INTERVALS)
@@ -343,23 +344,24 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
 
 def _add_two(found: SearchResult, barred: set[str]) -> bool:
     """Add the two best causes if each passes the tests beside the other; return True if so."""
-    task, model, notes = found.task, found.model, []
+    task, model, chosen = found.task, found.model, []
     for _ in range(2):
         part = replace(found, model=model, reasons={})
         rivals = _visible(part, _rivals(part, barred), set())
         best = next((r for r in rivals if not _doubt(task, r)), None)
-        if best is None:
+        if best is None or (best.added.cause.of_model and not task.fixed_dynamics):
             return False
         model = best.model
-        notes.append((best, rivals))
-    for best, _ in notes:
+        chosen.append((best, rivals))
+    weighed = []
+    for best, _ in chosen:
         without, _ = improve(task, model.without(best.added.name), 3)
-        evidence = weigh(task, without, model, best.added.size)
-        if not evidence.enough or best.added.cause.of_model:
+        weighed.append(weigh(task, without, model, best.added.size))
+        if not weighed[-1].enough:
             return False
-    for best, rivals in notes:
+    for (best, rivals), evidence in zip(chosen, weighed, strict=True):
         _note(found, best, rivals, evidence)
-    _take(found, notes[-1][0], evidence.gain)
+    _take(found, chosen[-1][0], weighed[-1].gain)
     return True
 
 
