@@ -20,6 +20,7 @@ from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening
+from valveflow_ros.diagnosis.slow import half_hours, regressions
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
@@ -30,6 +31,11 @@ _SHRINK = (4.0, 30.0)
 _LAGS = 60
 _ENOUGH = 0.75
 _RESPONSE = 500  # means, of the noise model's answer to one innovation
+_SLOW = (
+    'load of the last hour', 'load of the last four hours', 'load of hours before',
+    'travel of the last hour', 'pressure given u',
+)  # fmt: skip
+_SLOW_HATS = 5
 _IN_TRIPLES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 
 
@@ -158,18 +164,56 @@ def structure(task: Task, model: Extended, wandering: FloatArray | None = None) 
     wandering : float64 (m,), optional
         A slow disturbance in MW, which is subtracted first. If no structure remains, the whole
         residual is tested again, without the time and the time of day as variables.
+
+    If none of these tests finds a structure, half-hour means are tested; see `_over_hours`.
     """
     everything = task.residual(model)
     values = variables(task, model)
-    if wandering is None:
-        return _tabulated(task, everything, values)
-    values.pop('time')
-    left = _tabulated(task, everything - wandering, values)
+    slow = {name: values[name] for name in _SLOW}
+    if wandering is not None:
+        values.pop('time')
+    left = _tabulated(task, everything - (0.0 if wandering is None else wandering), values)
     if left.there:
         return left
-    values.pop('time of day')
-    whole = _tabulated(task, everything, values)
-    return whole if whole.there else left
+    if wandering is not None:
+        values.pop('time of day')
+        whole = _tabulated(task, everything, values)
+        if whole.there:
+            return whole
+    over_hours = _over_hours(task, model, slow)
+    return over_hours if over_hours is not None and over_hours.there else left
+
+
+def _over_hours(task: Task, model: Extended, values: dict[str, FloatArray]) -> Structure | None:
+    """Search for a dependence on what changes over hours; None if there is none.
+
+    Whitening leaves little of such an effect. So half-hour means of the residual are regressed on
+    piecewise-linear functions of one variable at a time, beside a wander of free variance and
+    time scale. Every two coefficients must gain the logarithm of the number of means in
+    log-likelihood (Schwarz, Ann. Stat. 6, 1978).
+    """
+    rows, each = task.rows, max(1, round(_MINUTE_S / task.grids.mean_s))
+    names, columns = [], []
+    for name, minute in values.items():
+        x = np.repeat(minute, each)
+        x = np.append(x, np.full(len(rows) - len(x), x[-1]))
+        knots = np.quantile(x[rows], np.linspace(0.02, 0.98, _SLOW_HATS))
+        if np.all(np.diff(knots) > 0.0):
+            names.append(name)
+            columns += [np.interp(x, knots, hat) for hat in np.eye(_SLOW_HATS)]
+    found = half_hours(task, model, rows, columns)
+    if not names or not found.enough:
+        return None
+    places = [range(k * _SLOW_HATS, (k + 1) * _SLOW_HATS) for k in range(len(names))]
+    none, *fits = regressions(found, [(), *places])
+    k = max(range(len(names)), key=lambda k: fits[k].likelihood)
+    gain = fits[k].likelihood - none.likelihood
+    if gain <= 0.5 * _SLOW_HATS * float(np.log(len(found.power))):
+        return None
+    hats = found.free[:, places[k]]
+    noise = np.einsum('ki,ij,kj->k', hats, fits[k].covariance, hats)
+    explained = float(np.var(hats @ fits[k].coefficients) - noise.mean())
+    return Structure((names[k],), gain, float('inf'), explained)
 
 
 def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) -> Structure:
