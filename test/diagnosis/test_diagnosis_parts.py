@@ -15,6 +15,7 @@ import pytest
 from diagnosis_records import record, rough_model, table, unit
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 from streams import needs_jit
 
 from valveflow_ros.diagnosis import kernels, record_faults, search
@@ -22,7 +23,13 @@ from valveflow_ros.diagnosis.cause import FittedCause, SentenceValues, Stage
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import sign_flip
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
-from valveflow_ros.diagnosis.fitting import Task, base_mask, base_tangents, cause_tangents
+from valveflow_ros.diagnosis.fitting import (
+    Task,
+    base_mask,
+    base_tangents,
+    cause_tangents,
+    whitening,
+)
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
@@ -45,6 +52,9 @@ TYPICAL = {
     'saturation': (84.0,), 'region_lag': (30.0, 5.0, 250.0), 'reheater': (0.3, 20.0),
     'clock': (5.0,), 'curve_shape': (1.5, 1425.0, 150.0),
 }  # fmt: skip
+
+
+HOURS_BEFORE = 'load of hours before'
 
 
 @pytest.fixture(scope='module')
@@ -247,6 +257,24 @@ def test_the_size_of_a_remaining_structure_is_that_of_the_effect(grids, variable
     assert 0.3 * true_mw2 < found.explained_mw2 < 2.0 * true_mw2
 
 
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
+    samples = table(2.0, 1, (), unit())
+    grids = make_grids(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
+    plain = Extended(rough_model())
+    x = np.repeat(variables(Task(grids, grids.open_rows, np.zeros(4)), plain)[HOURS_BEFORE], 6)
+    x = np.concatenate([x, np.full(len(grids.power) - len(x), x[-1])])
+    rng, keep = np.random.default_rng(seed), np.exp(-grids.mean_s / (6.0 * 3600.0))
+    wander = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(0.0, 0.5, len(x)))
+    noise = wander + rng.normal(0.0, 1.0, len(x))
+    for size, there in ((0.0, False), (0.8, True)):
+        power = answer(grids, plain) + noise + size * np.sign(x - np.median(x))
+        seen = replace(grids, power=power)
+        found = structure(Task(seen, grids.open_rows, whitening(seen, noise)), plain)
+        assert found.there == there
+        assert not there or HOURS_BEFORE in found.variables
+
+
 def test_scores_of_noise_have_even_chances():
     rng = np.random.default_rng(4)
     chances = [sign_flip(rng.normal(size=30)) for _ in range(40)]
@@ -360,5 +388,5 @@ def test_a_cause_in_doubt_hides_no_other(
     monkeypatch.setattr(search, '_without_onset', lambda *_: '')
     monkeypatch.setattr(search, '_small', doubt)
     monkeypatch.setattr(search, 'weigh', weigh)
-    assert not _add(SearchResult(None, model, model), set())  # type: ignore[arg-type]
+    assert not _add(SearchResult(None, model, model, model), set())  # type: ignore[arg-type]
     assert seen == weighed
