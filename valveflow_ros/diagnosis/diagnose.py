@@ -464,8 +464,6 @@ def _course(found: SearchResult) -> Course | None:
         mine = (NAMED_SHAPE, *_SHAPES.get(families, ()))
     best = max((c for c in tried.values() if c.name not in mine), key=lambda c: c.score)
     if names:
-        if 'intervals' in names and best.name == NO_SHAPE:
-            return None  # every switching time costs a parameter; a disturbance needs none for it
         least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
         if best.score - max(tried[shape].score for shape in mine) <= least:
             return None
