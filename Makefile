@@ -99,7 +99,7 @@ study: setup
 
 study-diagnosis: setup
 	@$(ENV) python -m benchmarks.diagnosis_study --kind null --seeds 150 --first 9000
-	@$(ENV) for kind in hidden pair confounded outside slow; do \
+	@$(ENV) for kind in hidden pair triple confounded outside slow; do \
 	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 9000 --high 3 || exit 1; done
 
 certify-partition: setup

@@ -14,8 +14,11 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from scipy.stats import binomtest
 
+from docs.page_claims import true_causes
 from docs.picture_data import CASES, DATA
+from valveflow_ros.diagnosis.evidence import LEAST_GAIN
 
 mpl.use('svg')
 from matplotlib import pyplot as plt
@@ -129,9 +132,51 @@ def _record(name: str, view: dict[str, Any]) -> Path:
     return _save(figure, name)
 
 
+CHANCE = 'chance_of_a_name'
+_SIZES = (0.0, 4.0, 5.0, 6.0, 7.0, 8.5, 10.0, 12.0, 15.0, 20.0, 30.0, np.inf)
+
+
+def chance() -> Path:
+    """Draw how often a true cause is named, against its size over its standard error."""
+    size, *answers = np.array(true_causes()).T
+    place = np.digitize(size, _SIZES)
+    bins = np.unique(place)
+    count = np.array([np.sum(place == k) for k in bins])
+    middle = np.array([np.median(size[place == k]) for k in bins])
+    figure, axis = plt.subplots(figsize=(9, 3.6))
+    for told, label, colour, shift in zip(
+        answers, ('named', 'named, or listed as not told apart from a name'), (EXTENDED, PLAIN),
+        (0.985, 1.015), strict=True,
+    ):  # fmt: skip
+        hits = [int(told[place == k].sum()) for k in bins]
+        share = np.array(hits) / count
+        ends = np.array([
+            binomtest(k, int(n)).proportion_ci(0.95, 'wilson')
+            for k, n in zip(hits, count, strict=True)
+        ])  # fmt: skip
+        axis.errorbar(
+            shift * middle, share, abs(ends.T - share), fmt='o-', ms=4, lw=1.0, color=colour,
+            label=label,
+        )  # fmt: skip
+    for x, n in zip(middle, count, strict=True):
+        axis.annotate(f'{n}', (x, 1.04), ha='center', fontsize=8, color=MUTED)
+    axis.axvline(np.sqrt(2.0 * LEAST_GAIN), color=MUTED, lw=1.0, ls='--')
+    axis.set(xscale='log', ylim=(-0.03, 1.12), ylabel='share of the true causes',
+             xlabel='size of the effect over its standard error')  # fmt: skip
+    ticks = [2, 3, 4, 6, 8, 10, 15, 20, 30, 50]
+    axis.set_xticks(ticks, labels=[str(tick) for tick in ticks])
+    axis.minorticks_off()
+    _legend(axis, 2)
+    figure.tight_layout()
+    return _save(figure, CHANCE)
+
+
 def main(names: list[str]) -> int:
     """Draw what is named, or everything there are data for."""
-    for name in names or CASES:
+    for name in names or (*CASES, CHANCE):
+        if name == CHANCE:
+            print(chance().name)
+            continue
         if not (DATA / f'{name}.json').exists():
             print(f'{name}: no data; run python -m docs.picture_data {name}')
             continue

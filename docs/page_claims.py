@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -45,8 +46,9 @@ _COVERAGE = {
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_34000_34005', 'null_47000_47099'
-_SMALL = 'diagnosis_hidden_34100_34102_5d'
+_HIDDEN, _NULL = 'hidden_51300_51302', 'null_47000_47099'
+_PAIRS, _TRIPLES = 'pair_51000_51003', 'triple_50100_50105'
+_SMALL = 'diagnosis_hidden_51600_51601_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
     'every second': 'thermal_names_1s_3501_3517',
@@ -171,14 +173,14 @@ def _diagnosis() -> list[Row]:
     for name, question in (
         (_HIDDEN, 'one hidden effect: named, and no other'),
         (_NULL, 'nothing wrong: nothing named, and nothing said to be unexplained'),
-        ('slow_47200_47204',
+        ('slow_51200_51203',
          'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
          'may be named): told as a change in time, and nothing named'),
         ('confounded_47300_47303', 'two causes that look alike'),
-        ('pair_46000_46005', 'two causes at once: both named'),
-        ('triple_46100_46105', 'three causes at once: all named'),
-        ('outside_33000_33002', 'effects outside the catalogue: none named'),
+        (_PAIRS, 'two causes at once: both named'),
+        (_TRIPLES, 'three causes at once: all named'),
+        ('outside_51500_51501', 'effects outside the catalogue: none named'),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
         text = f'{r["right"]} of {r["records"]}'
@@ -237,6 +239,29 @@ def _listed(row: dict[str, Any]) -> bool:
     )  # fmt: skip
 
 
+def true_causes() -> list[tuple[float, bool, bool]]:
+    """Return every true cause of the studies of one (also a small one), two and three causes.
+
+    Returns
+    -------
+    list of tuple
+        Its size relative to its standard error, which is the root of twice the log-likelihood
+        that it gains beside the other true causes; whether it was named; whether it was named or
+        listed as not told apart from a name.
+    """
+    out = []
+    large = (f'diagnosis_{study}_5d' for study in (_HIDDEN, _PAIRS, _TRIPLES))
+    for study in (_SMALL, *large):
+        for row in result(study)['rows']:
+            told = set(row['names'])
+            if 'curve_change' in told:
+                told.add('curve_shape')  # a bend is also a change of the curve
+            for name, gain in row['best']['each'].items():
+                listed = name in told or name in row['not_told_apart']
+                out.append((math.sqrt(2.0 * max(gain, 0.0)), name in told, listed))
+    return out
+
+
 def _in_minutes() -> Row:
     """Return what means over a minute tell of an effect of the temperature and of a backlash."""
     found = result(_MINUTE)
@@ -276,7 +301,7 @@ def _bends(study: dict[str, Any]) -> str:
 
 def _since_model() -> Row:
     """Return how well a diagnosis tells what changed since the model that it is given."""
-    name = 'reference_26101_26105'
+    name = 'reference_26201_26203'
     kinds = list(result(name)['summary'].values())
     of = {what: [s[what] for s in kinds] for what in kinds[0]}
     one = [s for what in ('gain', 'offset', 'input') for s in of[what]]
