@@ -101,6 +101,7 @@ study-diagnosis: setup
 	@$(ENV) python -m benchmarks.diagnosis_study --kind null --seeds 150 --first 9000
 	@$(ENV) for kind in hidden pair triple confounded outside slow; do \
 	  python -m benchmarks.diagnosis_study --kind $$kind --seeds 20 --first 9000 --high 3 || exit 1; done
+	@$(ENV) python -m benchmarks.diagnosis_study --seeds 20 --first 9100 --low 1 --high 1.5
 
 certify-partition: setup
 	@$(ENV) python -m benchmarks.partition --certify --kinds valve --sizes 305633

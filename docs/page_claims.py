@@ -224,8 +224,9 @@ def _at_best(r: dict[str, Any]) -> str:
         f'{sum(map(_listed, r["rows"]))} more; where each true cause gains at least 16 in '
         f'log-likelihood beside the others: {best["right"]} of {best["records"]} right, in '
         f'{best["wrong_and_likelier"]} of the others what was named fits better than the truth; '
-        f'reduction of the squared error on held-out blocks relative to that by the true causes: '
-        f'median {share["median"]:.2f}, one in ten below {share["worst_tenth"]:.2f}'
+        f'in records answered rightly, reduction of the squared error on held-out blocks relative '
+        f'to that by the true causes: median {share["median"]:.2f}, one in ten below '
+        f'{share["worst_tenth"]:.2f}'
     )
 
 

@@ -224,6 +224,7 @@ _SHAPES = {
 }  # fmt: skip
 # Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
 _ANOTHER_SHAPE = 6.0
+_FAMILIES = ('drift', 'step')  # families of causes that are also shapes
 _LEAST_SHAPE = 5.0  # the same for a shape over a slow disturbance without a shape
 _LAST_STEPS = 10  # breakpoints converge slowly near a bump
 _FULL_LOAD = 0.9  # quantile of the power
@@ -446,7 +447,7 @@ def _look_again(found: SearchResult) -> _Rest:
     return _Rest(slow, left, period(found.task, found.model), slowly, own)
 
 
-def _course(found: SearchResult) -> Course | None:
+def _course(found: SearchResult, again: bool = True) -> Course | None:
     """Return the shape of a change in time that the causes do not explain; None if there is none.
 
     Causes in time are removed if another shape, or a slow disturbance without a shape, fits better
@@ -473,11 +474,12 @@ def _course(found: SearchResult) -> Course | None:
             found.near.pop(name, None)
             found.reasons[name] = _OF_SHAPE[best.name]
         found.model, _ = improve(found.task, found.model, 3)
-        if best.name not in families and add_of_family(found, best.name):
+        other_family = again and best.name in _FAMILIES and best.name not in families
+        if other_family and add_of_family(found, best.name):
             # The causes of another family hid those of this shape.
             confirm(found)
             found.model = _dated(found)
-            return _course(found)
+            return _course(found, again=False)
     least_mw = LEAST_DRIFT_MW * found.task.grids.size
     if best.score - tried[NO_SHAPE].score < _LEAST_SHAPE or best.rms_mw <= least_mw:
         return None

@@ -215,18 +215,18 @@ def search(
     if task.grids.form.scaled:
         # They were determined together with the form, in this record or that of the given model:
         # the exponent is a parameter of it, and the curve shape is the error of straight pieces.
-        for name in ('exponent', 'curve_shape'):
+        for name in ('exponent', _BEND):
             found.reasons[name] = (
                 'cannot be judged: in the form p^m F(V) + c the exponent m and the curve F are '
                 'results of the fit, with no expected values to compare them with'
             )
             barred.add(name)
     elif not earlier_curve:
-        found.reasons['curve_shape'] = (
+        found.reasons[_BEND] = (
             'cannot be judged without an earlier model whose curve still holds: breakpoints that '
             'are found from the same record follow a bend too'
         )
-        barred.add('curve_shape')
+        barred.add(_BEND)
     found.tried = len(every) - len(barred)
     found = _extended(found, barred, progress)
     for name in catalogue():
@@ -403,7 +403,7 @@ def _without_onset(task: Task, rival: Rival) -> str:
 
 def _small(task: Task, rival: Rival) -> str:
     """Return why a bend is none: the straight pieces of a healthy valve miss as much; or ''."""
-    if rival.added.name != 'curve_shape':
+    if rival.added.name != _BEND:
         return ''
     least = _LEAST_HEIGHT * float(np.max(task.grids.power))
     if abs(rival.added.values[0]) > least:

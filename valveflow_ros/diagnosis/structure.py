@@ -157,15 +157,13 @@ def _held_out(cell: np.ndarray, rest: FloatArray, fold: np.ndarray, shrink: floa
 
 
 def structure(task: Task, model: Extended, wandering: FloatArray | None = None) -> Structure:
-    """Search for structure in the residual of a model.
+    """Search for structure in the residual of a model, by cells and then over hours.
 
     Parameters
     ----------
     wandering : float64 (m,), optional
         A slow disturbance in MW, which is subtracted first. If no structure remains, the whole
         residual is tested again, without the time and the time of day as variables.
-
-    If none of these tests finds a structure, half-hour means are tested; see `_over_hours`.
     """
     everything = task.residual(model)
     values = variables(task, model)
