@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.torture.memory import MIB, descriptors, peak, resident, threads
-from benchmarks.torture.trial import Options, Outcome
+from benchmarks.torture.trial import MIB, Options, Outcome, memory
 from valveflow_ros.curve.characteristic import Characteristic
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.task import FitTask
@@ -53,11 +52,16 @@ def soak(options: Options) -> Outcome:
             walk.feed(block)
         if (day + 1) % period == 0:
             gc.collect()
-            held.append((day + 1, round(resident() / MIB, 2)))
-            kept.add((descriptors(), threads()))
+            held.append((day + 1, round(memory('VmRSS') / MIB, 2)))
+            kept.add((_entries('fd'), _entries('task')))
     walk.close()
     _judge(outcome, held, kept, walk, days)
     return outcome
+
+
+def _entries(kind: str) -> int:
+    """Return the number of descriptors ('fd') or threads ('task') of this process."""
+    return len(list(Path('/proc/self', kind).iterdir()))
 
 
 class _Walk:
@@ -178,7 +182,7 @@ def _judge(
     outcome.counts = {'days': days, 'rows': walk.monitor.rows, **dict(sorted(walk.counts.items()))}
     outcome.measured = {
         'resident_mib_after_day': dict(held),
-        'peak_mib': round(peak() / MIB, 1),
+        'peak_mib': round(memory('VmHWM') / MIB, 1),
         'growth_mib_in_30_days': round(growth, 3),
         'descriptors_and_threads': sorted(kept),
     }

@@ -1,8 +1,11 @@
 # Copyright 2026 valveflow maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What judges the project's speed, judged by what must hold of any judge."""
+"""What judges the project's speed, judged by what must hold of any judge; all programs load."""
 
 from __future__ import annotations
+
+import importlib
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -50,3 +53,12 @@ def test_three_disturbed_pairs_of_seven_change_nothing_and_four_do_nor_does_the_
 def test_nothing_is_judged_by_too_little(times) -> None:
     with pytest.raises(ValueError, match='work: '):
         judge({'work': times})
+
+
+def test_every_program_finds_what_it_imports() -> None:
+    root = Path(__file__).resolve().parents[2]
+    paths = sorted((root / 'benchmarks').rglob('*.py'))
+    assert len(paths) > 40
+    for path in paths:
+        if path.stem not in ('__init__', '__main__'):
+            importlib.import_module('.'.join(path.relative_to(root).with_suffix('').parts))
