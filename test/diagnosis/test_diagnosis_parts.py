@@ -86,6 +86,18 @@ def test_every_cause_changes_the_answer_and_nothing_is_nothing(grids, name):
     assert np.abs(changed - answer(grids, plain))[grids.scored].max() > 1e-3
 
 
+def test_an_answer_is_the_same_whatever_was_asked_before(grids):
+    stiction = FittedCause(catalogue()['stiction'], TYPICAL['stiction'])
+    free = Extended(rough_model()).with_cause(stiction)
+    ar = np.zeros(ORDER)
+    path = held(replace(grids, cache={}), free, ar)  # the path of the plug as estimated
+    used = replace(grids, cache={})
+    answer(used, free)
+    for model in (path, free, path):
+        np.testing.assert_array_equal(answer(used, model), answer(replace(grids, cache={}), model))
+    assert np.abs(answer(used, path) - answer(used, free))[grids.scored].max() > 0.01
+
+
 @pytest.mark.parametrize('name', sorted(NAMES))
 def test_tangents_of_causes_predict_small_changes(grids, name):
     cause = catalogue()[name]

@@ -95,7 +95,8 @@ def _input(grids: Grids, model: Extended) -> FloatArray:
     chain = sorted(model.at(Stage.OPENING), key=lambda a: a.cause.order)
     if not chain:
         return grids.u
-    key = tuple((a.name, a.values, a.extra) for a in chain)
+    # By the function, not by the name: the path of a plug may be held, or one of several drawn.
+    key = tuple((a.cause.act, a.values, a.extra) for a in chain)
     u = grids.cache.get(key)
     if u is None:
         v = grids.v

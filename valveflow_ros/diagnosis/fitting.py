@@ -109,9 +109,12 @@ def believed_residual(grids: Grids, model: Extended, a: FittedCause, ar: FloatAr
     return np.asarray(np.einsum('km,km->m', rest, belief))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Path:
-    """The weighted mean path of the plug in one record, for fixed parameter values."""
+    """The weighted mean path of the plug in one record, for fixed parameter values.
+
+    Two of them are never equal: results are cached by the function that gives them.
+    """
 
     path: FloatArray
     values: Values

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -76,8 +77,9 @@ def _noise(v: FloatArray, grids: Grids) -> FloatArray:
     return grids.cache['noise of v']
 
 
+@functools.cache
 def draw(number: int) -> Callable[[FloatArray, Values, Grids], FloatArray]:
-    """Return the ``act`` function of one noise realisation."""
+    """Return the ``act`` function of one noise realisation, the same for every call."""
 
     def path(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
         out = np.empty(len(v))
