@@ -21,13 +21,14 @@ from streams import needs_jit
 from valveflow_ros.diagnosis import kernels, record_faults, search
 from valveflow_ros.diagnosis.cause import FittedCause, SentenceValues, Stage
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
-from valveflow_ros.diagnosis.evidence import sign_flip
+from valveflow_ros.diagnosis.evidence import chance_of_gain
 from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
 from valveflow_ros.diagnosis.fitting import (
     Task,
     base_mask,
     base_tangents,
     cause_tangents,
+    held,
     whitening,
 )
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
@@ -287,12 +288,35 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
         assert not there or HOURS_BEFORE in found.variables
 
 
-def test_scores_of_noise_have_even_chances():
+def test_changes_that_are_none_have_even_chances_and_true_ones_small_ones():
     rng = np.random.default_rng(4)
-    chances = [sign_flip(rng.normal(size=30)) for _ in range(40)]
-    assert 0.3 < np.mean(chances) < 0.7
-    assert sign_flip(np.full(30, 1.0)) < 1e-4
-    assert sign_flip(-np.full(30, 1.0)) == 1.0
+    part = np.arange(4800) // 100
+    effect = np.where(rng.random(48) < 0.1, 1.0, 0.1)[part] * rng.normal(size=4800)
+    chances = np.array([
+        chance_of_gain(noise, noise - 0.2 * effect, part)
+        for noise in rng.normal(size=(1000, 4800))
+    ])  # fmt: skip
+    for level in (0.01, 0.05, 0.5):
+        spread = np.sqrt(level * (1.0 - level) / len(chances))
+        assert np.mean(chances < level) < level + 3.0 * spread
+    assert np.mean(chances < 0.5) > 0.4
+    noise = rng.normal(size=4800)
+    # It acts in a tenth of the parts: their signs alone would tell less.
+    assert chance_of_gain(noise + effect, noise, part) < 1e-6
+    assert chance_of_gain(noise + effect, noise + 2.0 * effect, part) > 0.5
+
+
+def test_where_something_else_acts_a_gain_is_held_against_all_that_was_tried():
+    rng = np.random.default_rng(5)
+    part = np.arange(4800) // 100
+    effect, other = rng.normal(size=(2, 4800))
+    alone = chance_of_gain(other + 0.04 * effect, other, part, tried=1)
+    assert 1e-4 < alone < 0.05
+    assert chance_of_gain(other + 0.04 * effect, other, part, tried=18) == alone
+    assert chance_of_gain(other + 0.04 * effect, other, part, tested=2) == 2 * alone
+    there = other + rng.normal(size=48)[part] * effect  # it follows the effect by half hours
+    few = chance_of_gain(there + 0.9 * effect, there, part)
+    assert chance_of_gain(there + 0.9 * effect, there, part, tried=18) == min(1.0, 18 * few)
 
 
 def test_faults_are_masked_where_they_are():

@@ -72,7 +72,7 @@ from valveflow_ros.signals.static_form import StaticForm
 # The sealed blocks are a test set, used only once: the gain of each cause on them.
 #
 # A cause found on the open blocks is named only if the sealed blocks, to which nothing was
-# fitted, confirm it at the 5 % level, corrected for the number of causes tried.
+# fitted, confirm it at the 5 % level.
 
 
 def confirm(found: SearchResult) -> None:
@@ -120,7 +120,8 @@ def _chances(found: SearchResult) -> list[float]:
     out = []
     for a in found.model.active:
         without, _ = improve(found.task, found.model.without(a.name), 3)
-        out.append(sealed_gain(found.task, without, found.model, found.tried).p_value)
+        tested = len(found.model.active)
+        out.append(sealed_gain(found.task, without, found.model, found.tried, tested).p_value)
     return out
 
 

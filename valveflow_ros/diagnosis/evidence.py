@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri, stdtr
 
 from valveflow_ros.diagnosis.cause import Estimate, FittedCause, Kind, Stage, Unknown
 from valveflow_ros.diagnosis.causes import causes_for
@@ -251,9 +252,8 @@ def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> floa
 # The gain of a cause on test blocks to which nothing was fitted; they are used once.
 
 LARGEST_P = 0.05
-_FLIPS = 100_000
-_CHUNK = 5_000
-_SEED = 7
+_LEAST_PARTS = 8
+_NO_CHANGE = 1e-3  # of the mean sum of squares of the change in a part
 _LEAST_SEGMENT_MEANS = 3
 
 
@@ -287,23 +287,26 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
     return float(np.sqrt(np.mean(fair_residual(task, model)[rows] ** 2)))
 
 
-def sealed_gain(task: Task, before: Extended, after: Extended, tried: int) -> Gain:
+def sealed_gain(
+    task: Task, before: Extended, after: Extended, tried: int, tested: int = 1
+) -> Gain:
     """Compare two models, both fitted to the open blocks, on the sealed ones.
 
     Times at which the onset may lie according to the open blocks do not count in the test: there
     the models cannot know whether the change has happened.
+
+    Parameters
+    ----------
+    tried, tested : int
+        Number of causes tried on the open blocks and tested on the sealed ones.
     """
     rows = task.grids.sealed_rows
     told = rows & ~_while_unsure(task, after)
-    # With fewer sub-blocks the sign test could never be significant.
-    enough = len(np.unique(task.grids.sub[told])) >= np.log2(max(tried, 1) / LARGEST_P)
+    enough = len(np.unique(task.grids.sub[told])) >= _LEAST_PARTS
     sealed = replace(task, rows=told if enough else rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
-    rest, change = sealed.innovations(old), sealed.innovations(old - new)
-    sub = task.grids.sub[sealed.rows]
-    scores = np.bincount(sub, rest * change).astype(np.float64)
-    chance = sign_flip(scores[np.bincount(sub) > 0])
-    chance = min(1.0, chance * max(tried, 1))
+    rests = sealed.innovations(old), sealed.innovations(new)
+    chance = chance_of_gain(*rests, task.grids.sub[sealed.rows], tried, tested)
     return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
 
 
@@ -338,26 +341,48 @@ def gain_of_form(task: Task, model: Extended, task_new: Task, new: Extended) -> 
     old_rest, new_rest = fair_residual(task, model), fair_residual(task_new, new)
     scored = rows.astype(np.uint8)
     sealed = replace(task_new, rows=rows, ar=fit_ar(new_rest, scored, ORDER))
-    rest, change = sealed.innovations(old_rest), sealed.innovations(old_rest - new_rest)
-    count = np.bincount(task.grids.sub[rows])
-    scores = np.bincount(task.grids.sub[rows], rest * change).astype(np.float64)
+    rests = sealed.innovations(old_rest), sealed.innovations(new_rest)
+    chance = chance_of_gain(*rests, task.grids.sub[rows])
     before, after = (float(np.sqrt(np.mean(e[rows] ** 2))) for e in (old_rest, new_rest))
-    return Gain(before, after, sign_flip(scores[count > 0]))
+    return Gain(before, after, chance)
 
 
-def sign_flip(scores: FloatArray) -> float:
-    """Return the p-value of a sum of scores under random signs.
+def chance_of_gain(
+    before: FloatArray, after: FloatArray, part: IntArray, tried: int = 1, tested: int = 1
+) -> float:
+    """Return the p-value of the gain of one model over another on rows to which none was fitted.
 
-    A score is the sum over a sub-block of predicted effect times residual without the cause. A
-    model fitted to other blocks is independent of the noise here, so without the cause both signs
-    are equally likely. Sub-blocks are long compared with the correlation time of the noise.
+    The score of a part (half an hour) is the sum of residual before times its change. A model
+    fitted to other rows is independent of the noise here, so the score has mean 0 if the change is
+    no improvement, and a variance proportional to the sum of squares of the change. The factor is
+    the variance of the rows times the dispersion of the parts after the change, which is above 1
+    if their rows are correlated or something else acts; the sum of the scores is Student's.
+
+    Parameters
+    ----------
+    before, after : float64 (n,)
+        Residuals of the two models.
+    part : int64 (n,)
+        Number of the part of each row.
+    tried, tested : int
+        Number of changes tried on other rows, and tested on these. Independent parts need a
+        correction for the second only. If the dispersion is more than a chance of 5 % allows,
+        what is left may repeat itself from part to part, here and where the change was chosen:
+        then the first counts.
     """
-    rng = np.random.default_rng(_SEED)
-    total, least = float(scores.sum()), 0
-    for _ in range(_FLIPS // _CHUNK):
-        signs = rng.integers(0, 2, (_CHUNK, len(scores))) * 2 - 1
-        least += int((signs @ scores >= total).sum())
-    return (least + 1.0) / (_FLIPS + 1.0)
+    change = before - after
+    own, scores, left = (
+        np.bincount(part, x * change).astype(np.float64) for x in (change, before, after)
+    )
+    acts = own > _NO_CHANGE * own.mean()
+    parts, variance = int(acts.sum()), float(after @ after) / max(len(after), 1)
+    if parts < 2 or not variance > 0.0:
+        return 1.0
+    squares = left[acts] ** 2 / (variance * own[acts])
+    even, weighted = float(squares.mean()), float(np.average(squares, weights=own[acts]))
+    error = np.sqrt(variance * max(1.0, even, weighted) * float(own.sum()))
+    number = tested if even <= chdtri(parts, LARGEST_P) / parts else max(tried, tested)
+    return min(1.0, number * float(stdtr(parts - 1, -scores.sum() / error)))
 
 
 def noise_floor(task: Task, model: Extended, explained_mw2: float) -> float:

@@ -188,7 +188,7 @@ def _proof(data: Diagnosed) -> Section:
     ]  # fmt: skip
     told = html.paragraph(
         'What each cause gains there; p is the probability of such a gain by chance, '
-        'corrected for the number of causes tried:'
+        'corrected for the number of causes tested:'
     ) + html.table(['cause', 'before (MW)', 'after (MW)', 'smaller by', 'p'], gains)
     return html.section(
         '4. Check on held-out data',

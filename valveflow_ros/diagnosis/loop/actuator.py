@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from valveflow_ros.diagnosis.evidence import sign_flip
+from valveflow_ros.diagnosis.evidence import chance_of_gain
 from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD, SUBS_IN_BLOCK, Grids
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
@@ -214,7 +214,7 @@ class ActuatorFault:
     rms_before, rms_after : float
         RMS of position minus model on sealed (test) blocks, in % of opening.
     p_value : float
-        p-value of the gain on these blocks, as in `evidence.sign_flip`.
+        p-value of the gain on these blocks, as in `evidence.chance_of_gain`.
     """
 
     name: str
@@ -370,12 +370,10 @@ def judge_rows(
         return None
     tested = pairs.part(sealed)
     old, new = tested.rest(plain.plan, plain.values), tested.rest(best.plan, best.values)
-    scores = np.bincount(sub[sealed], old * (old - new)).astype(np.float64)
-    scores = scores[np.unique(sub[sealed])]
     rms = [float(np.sqrt(np.mean(r**2))) if len(r) else np.nan for r in (old, new)]
     if not rms[1] < rms[0]:
         return None
-    chance = min(1.0, len(fits) * sign_flip(scores))
+    chance = chance_of_gain(old, new, sub[sealed], len(fits))
     noise = np.inf if rests else float(np.sqrt(best.cost))
     sharp = sized(best.plan.name, command + offset, position, step_s, best.values, noise)
     parameters = (
