@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Cause, FittedCause, Start, Values
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.fitting import (
@@ -22,6 +23,7 @@ from valveflow_ros.diagnosis.fitting import (
     base_mask,
     base_tangents,
     cause_tangents,
+    improve,
     level_tangents,
 )
 from valveflow_ros.diagnosis.grids import DAY_S, Grids
@@ -55,6 +57,7 @@ def nuisance(task: Task, model: Extended) -> FloatArray:
 HATS = 13
 _SECANT = 0.004
 _EDGE_SHARE = 0.04
+_STEPS = 5
 GAIN, INPUT, OFFSET, CURVE = 0, 1, 2, 3  # carriers (basic effects); the curve has HATS of them
 
 
@@ -188,6 +191,17 @@ class Screening:
         toward = self.n.T @ left
         cost = float(left @ left) - float(toward @ self._inverse @ toward)
         return Start(cause.clipped(values), (self.floor - cost) / (2.0 * self.variance), extra)
+
+    def fitted(self, cause: Cause, values: Values, base: RegionalModel | None = None) -> Start:
+        """Return the start of a cause after a few steps of a fit of the whole model.
+
+        It is for effects of which the curve and the dynamics of the model, fitted without them,
+        contain much already. The steps begin at ``base``, by default that of the model.
+        """
+        model = self.model if base is None else replace(self.model, base=base)
+        model, cost = improve(self.task, model.with_cause(FittedCause(cause, values)), _STEPS)
+        gain = (self.task.cost(self.model) - cost) / (2.0 * self.variance)
+        return Start(model.active[-1].values, gain, base=model.base)
 
     def _explained(self, model: Extended) -> FloatArray:
         """Return the change of the prediction by one more cause in MW, shape (m,)."""

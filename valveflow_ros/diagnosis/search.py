@@ -141,11 +141,13 @@ NOT_TOLD_APART = 10.0
 # physics with numbers 5001 to 5012.
 _LEAST_HEIGHT = 0.0025
 KEPT_LEAST = 8.0
+_SAME_COST = 0.999  # a smaller part of the sum of squares is another minimum of the same model
 _LEAST_EXCHANGE = 1.0  # log-likelihood: less is no reason to fit everything again
 STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
 _SHORT_STEPS_MW = (1.0, 0.4)
 _INTERVALS = 'intervals'
-_BEND, _BENDS = 'curve_shape', 2  # so many of the starts of a bend are refitted to the end
+_BEND = 'curve_shape'
+_REFITTED = 2  # starts of one cause with a base of their own that are refitted to the end
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +330,14 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
             found.reasons[rival.added.name] = doubt
             continue
         best = rival.score if best is None else best
-        without = found.model
+        without, cost = improve(found.task, rival.model.without(rival.added.name), 3)
+        now = found.task.cost(found.model)
+        if cost < now * _SAME_COST:
+            # The refit had led to a better curve, which needs no cause: all are tried on that one.
+            found.plain = found.plain if found.model.active else without
+            found.model = without
+            return _add(found, barred)
+        without = without if cost < now else found.model
         evidence = weigh(found.task, without, rival.model, rival.added.size)
         if not evidence.enough:
             found.reasons[rival.added.name] = evidence.reason()
@@ -505,16 +514,18 @@ def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
     tangents = None
     if shortlist:
         tangents = found.task.innovations(base_tangents(found.task, found.model))
-    refits, bends = [], []
+    refits: list[tuple[Extended, float]] = []
+    from_base: dict[str, list[tuple[Extended, float]]] = {}
     for name, start in shortlist:
         added = FittedCause(every[name], start.values, start.extra)
         if start.base is None:
             refits.append(_refit(found.task, found.model.with_cause(added), tangents))
         else:
             model = replace(found.model, base=start.base).with_cause(added)
-            bends.append(improve(found.task, model, 2))
-    for model, _ in sorted(bends, key=lambda b: b[1])[:_BENDS]:
-        refits.append(_refit(found.task, model, None))
+            from_base.setdefault(name, []).append(improve(found.task, model, 2))
+    for several in from_base.values():
+        best_first = sorted(several, key=lambda m: m[1])
+        refits += [_refit(found.task, model, None) for model, _ in best_first[:_REFITTED]]
     if not refits:
         return []
     # The noise variance is that of the best refit.

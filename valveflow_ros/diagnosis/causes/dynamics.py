@@ -13,7 +13,6 @@ from valveflow_ros.curve.regional_model import RegionalModel, make_taps
 from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import (
     Cause,
-    FittedCause,
     Kind,
     SentenceValues,
     Stage,
@@ -21,7 +20,6 @@ from valveflow_ros.diagnosis.cause import (
     Unknown,
     Values,
 )
-from valveflow_ros.diagnosis.fitting import improve
 from valveflow_ros.diagnosis.grids import Grids
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.errors import short
@@ -121,9 +119,9 @@ def reheater_starts(screening: Screening) -> Sequence[Start]:
     whole = float(np.median(base.time_constants + base.delays)) / (1.0 - alpha)
     quick = np.full(base.regions, max(_QUICK * whole, screening.grids.step_s))
     fitted = [
-        _fitted(screening, _SLOW, replace(base, time_constants=quicker)),
-        _fitted(
-            screening, (alpha, whole),
+        screening.fitted(REHEATER, _SLOW, replace(base, time_constants=quicker)),
+        screening.fitted(
+            REHEATER, (alpha, whole),
             replace(base, time_constants=quick, delays=np.zeros(base.regions)),
         ),
     ]  # fmt: skip
@@ -131,14 +129,6 @@ def reheater_starts(screening: Screening) -> Sequence[Start]:
         *screening.best(REHEATER, list(_REHEATER_TRIED), keep=1),
         *(start for start in fitted if start.gain > 0.0),
     ]
-
-
-def _fitted(screening: Screening, values: Values, base: RegionalModel) -> Start:
-    """Return a reheater fitted with the whole model, from these initial values on that base."""
-    task, model = screening.task, replace(screening.model, base=base)
-    model, cost = improve(task, model.with_cause(FittedCause(REHEATER, values)), _STEPS)
-    gain = (task.cost(screening.model) - cost) / (2.0 * screening.variance)
-    return Start(model.active[-1].values, gain, base=model.base)
 
 
 def reheater_sentence(values: dict[str, float]) -> str:

@@ -197,7 +197,7 @@ RATE_LIMIT = Cause(
 )  # fmt: skip
 
 
-_TRIED_SHARES = (0.6, 0.7, 0.78, 0.85, 0.9, 0.94, 0.97, 0.99)
+_TRIED_SHARES = (0.4, 0.7, 0.9)  # of the range of the opening
 
 
 def apply_saturation(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
@@ -211,9 +211,12 @@ def apply_saturation(v: FloatArray, values: Values, grids: Grids) -> FloatArray:
 
 
 def saturation_starts(screening: Screening) -> Sequence[Start]:
-    """Try several values among the highest openings."""
-    places = np.quantile(screening.grids.v[np.isfinite(screening.grids.v)], _TRIED_SHARES)
-    return screening.best(SATURATION, [(float(p),) for p in places])
+    """Fit the whole model from limits spread over the openings; its curve has become flatter."""
+    low, high = np.nanquantile(screening.grids.v, (0.01, 0.99))
+    fitted = [
+        screening.fitted(SATURATION, (low + share * (high - low),)) for share in _TRIED_SHARES
+    ]
+    return [start for start in fitted if start.gain > 0.0]
 
 
 def saturation_sentence(values: dict[str, float]) -> str:
