@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from valveflow_ros.cli import command
-from valveflow_ros.errors import RecordingError
 
 if TYPE_CHECKING:
     from valveflow_ros.interface.logs import Log
     from valveflow_ros.parameters import Settings
     from valveflow_ros.records import Readings, Signal
 
-_LARGE_BYTES = 20_000_000  # smaller files are read without noticeable delay
 _GAP_STEPS = 3.5  # a pause of more than this many usual steps is a gap
 
 _OTHER_NS = 60 * 10**9  # beyond it, times of messages and of their values differ
@@ -40,8 +38,6 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Read the log and describe it."""
     mapping = command.mapping_of(options)
     console(0.1, 'reading')
-    if not options.json and (told := _summary(options.log)):
-        console.say(told)
     from valveflow_ros.interface.logs import open_log, steps_of
     from valveflow_ros.interface.plausibility import limits
     from valveflow_ros.interface.settings import settings_for
@@ -167,30 +163,6 @@ def _text(
         f'Damaged: {damaged}; "valveflow recover" makes a whole file of the rest.'
         if damaged
         else '',
-    )
-
-
-def _summary(path: Path) -> str:
-    """Return a sentence from the summary of a large complete recording; '' otherwise."""
-    from valveflow_ros.logs.mcap.records import read_summary
-    from valveflow_ros.logs.source import Source
-    from valveflow_ros.report.words import count, duration, moment
-
-    if path.suffix.lower() != '.mcap':
-        return ''
-    try:
-        with Source.open(path) as source:
-            summary = read_summary(source) if source.size >= _LARGE_BYTES else None
-    except RecordingError:
-        # Reading the file will show the error.
-        return ''
-    if summary is None or not summary.messages:
-        return ''
-    length = duration((summary.end_ns - summary.start_ns) / 1e9)
-    topics = sorted(c.topic for n, c in summary.table.channels.items() if summary.counts.get(n))
-    return (
-        f'{path}: {count(summary.messages)} messages in {length} from {moment(summary.start_ns)}, '
-        f'on {", ".join(topics)}. Every value is now looked at.'
     )
 
 
