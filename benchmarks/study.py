@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import platform
 import shlex
@@ -29,7 +28,7 @@ from valveflow_ros.monitoring.monitor import Monitor
 from valveflow_ros.parameters import Settings
 from valveflow_ros.plant.simulator import simulate
 from valveflow_ros.plant.unit import UnitDescription
-from valveflow_ros.records import SampleTable, SpecialSegment
+from valveflow_ros.records import SampleTable, SpecialSegment, finite
 
 RESULTS = Path(__file__).resolve().parent / 'results'
 PAPER = 'paper'
@@ -82,15 +81,6 @@ def by(key: str, rows: Iterable[dict[str, Any]]) -> dict[str, list[dict[str, Any
     for row in rows:
         groups.setdefault(row[key], []).append(row)
     return groups
-
-
-def finite(value: Any) -> Any:
-    """Return the value with null where JSON knows no number."""
-    if isinstance(value, dict):
-        return {k: finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def keep(name: str, folder: Path | None = RESULTS, show: bool = True, **content: Any) -> None:

@@ -13,8 +13,10 @@ import enum
 import math
 import re
 import zoneinfo
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import timedelta, timezone, tzinfo
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -291,3 +293,14 @@ def zone_of(name: str) -> tzinfo | None:
             f"Time zone '{name}' is not known; use a name such as Europe/Berlin, or an offset "
             'such as +01:00.'
         ) from None
+
+
+def finite(value: Any) -> Any:
+    """Return a value for JSON, which has no NumPy numbers, no NaN and no infinity (None here)."""
+    if isinstance(value, Mapping):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

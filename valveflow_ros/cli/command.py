@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 from argparse import ArgumentParser, Namespace
@@ -159,7 +158,9 @@ class Console(Progress):
         """Print the result."""
         self._line.end()
         if self._as_json:
-            text = json.dumps(_finite(outcome.data), indent=2, allow_nan=False, ensure_ascii=False)
+            from valveflow_ros.records import finite
+
+            text = json.dumps(finite(outcome.data), indent=2, allow_nan=False, ensure_ascii=False)
             text = self._told(text)
             self._out.write(_COMMANDS.sub(lambda c: f'\\u{ord(c[0]):04x}', text) + '\n')
         elif outcome.text:
@@ -186,17 +187,6 @@ class Console(Progress):
 def _harmless(text: str) -> str:
     """Return a text safe for a terminal: it may contain external names and table cells."""
     return _COMMANDS.sub('?', text)
-
-
-def _finite(value: Any) -> Any:
-    """Replace values that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 class TableOption(NamedTuple):

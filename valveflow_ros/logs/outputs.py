@@ -18,6 +18,7 @@ import numpy as np
 from valveflow_ros.errors import DataError
 from valveflow_ros.logs.contents import LogContents
 from valveflow_ros.logs.mcap.definitions import Field, Fields, full_name, parse_all
+from valveflow_ros.records import finite
 
 OUTPUTS = {
     'curves': 'valveflow_msgs/msg/FlowCharacteristic',
@@ -113,15 +114,6 @@ def _cell(value: Any) -> Any:
     if isinstance(value, list | dict):
         return json.dumps(finite(value), ensure_ascii=False)
     return value
-
-
-def finite(value: Any) -> Any:
-    """Replace numbers that are not finite by None: JSON cannot hold them."""
-    if isinstance(value, dict):
-        return {k: finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _parquet(

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valveflow_ros.records import FloatArray, IntArray
+from valveflow_ros.records import FloatArray, IntArray, finite
 
 Spec = dict[str, Any]
 DAY_HOUR = '%{x|%d %b %H:%M}<br>'  # the time in the first line of a hover text
@@ -44,20 +44,8 @@ class Figure:
     def to_json(self) -> str:
         """Return the figure for the script of the page; safe inside a script element."""
         content = {'data': self.traces, 'layout': {**self.layout, 'height': self.height}}
-        text = json.dumps(_clean(content), separators=(',', ':'), allow_nan=False)
+        text = json.dumps(finite(content), separators=(',', ':'), allow_nan=False)
         return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
-
-
-def _clean(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _clean(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_clean(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 # Numbers for a figure.

@@ -30,7 +30,7 @@ from valveflow_ros.interface.identify import Identification, identify
 from valveflow_ros.interface.logs import Log, open_log
 from valveflow_ros.interface.models import load_characteristic
 from valveflow_ros.interface.monitor import MonitorResult, monitor
-from valveflow_ros.records import NS_PER_S
+from valveflow_ros.records import NS_PER_S, finite
 from valveflow_ros.report.answer import explained
 from valveflow_ros.report.data import rejected
 from valveflow_ros.report.fleet import UNITS
@@ -100,7 +100,7 @@ def unit_month(task: FleetTask) -> Row:
             shutil.rmtree(task.place / verb, ignore_errors=True)
         row = _judged(task)
         row['task_s'] = time.perf_counter() - begun
-        text = json.dumps(_finite({'key': key, 'row': row}), allow_nan=False)
+        text = json.dumps(finite({'key': key, 'row': row}), allow_nan=False)
         write_texts(task.place, {_ROW: text + '\n'})
         # Return the same types as a row that was read from its file.
         return {**json.loads(text)['row'], 'anew': True}
@@ -327,14 +327,3 @@ def _monitor_facts(found: MonitorResult) -> Row:
         'monitor_diagnoses': [{**d, 'causes': list(d['causes'])} for d in content['diagnoses']],
         'wear_mw_per_month': wear.get('mw_per_month'),
     }
-
-
-def _finite(value: Any) -> Any:
-    """Replace values that JSON cannot represent: NumPy scalars, NaN and infinity."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value

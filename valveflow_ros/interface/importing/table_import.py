@@ -37,6 +37,7 @@ from valveflow_ros.records import (
     Readings,
     SampleTable,
     Signal,
+    finite,
     table_to_readings,
 )
 from valveflow_ros.report.data import Gap, gaps
@@ -363,11 +364,7 @@ class TableImport:
     def as_json(self) -> str:
         """Return the summary as JSON text for the log, with the file's name without its path."""
         content = {**self.summary(), 'source': self._reader.path.name}
-        finite = [
-            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in s.items()}
-            for s in content['signals']
-        ]
-        return json.dumps({**content, 'signals': finite}, indent=2, allow_nan=False)
+        return json.dumps(finite(content), indent=2, allow_nan=False)
 
     def _read_further(self) -> None:
         path = self._reader.path
