@@ -63,7 +63,15 @@ from valveflow_ros.diagnosis.slow import (
     courses,
     drift,
 )
-from valveflow_ros.diagnosis.structure import Period, Structure, Wander, period, structure, wander
+from valveflow_ros.diagnosis.structure import (
+    Period,
+    Structure,
+    Wander,
+    likelier_than_the_hour,
+    period,
+    structure,
+    wander,
+)
 from valveflow_ros.errors import DataError, counted, listed
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 from valveflow_ros.signals.compression import Compression
@@ -213,7 +221,7 @@ _LEAST_EXPLAINED = 0.001
 # A slack shows at reversals only, where the straight pieces of a healthy valve matter less: fixed
 # on the sets 88001 and 89001 of `benchmarks.naming`, where false ones explained up to 0.0003.
 _LEAST_SLACK = 0.0004
-_BEND = 'curve_shape'
+_BEND, _DAILY = 'curve_shape', 'diurnal'
 # Causes that change the level of the power in time, and equivalent shapes, by their families.
 _LEVELS = (
     'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
@@ -356,6 +364,7 @@ def diagnose(
             since = left
     progress(0.7, 'the sealed blocks')
     confirm(found)
+    _withdraw_daily(found)
     _withdraw_small(found)
     found.model = _dated(found)
     progress(0.8, 'what is left')
@@ -557,6 +566,18 @@ def _own_misfit(found: SearchResult, left: Structure) -> str:
         f'Straight pieces and the dynamics of the model leave {size:.2g} MW (root mean square) '
         f'that depends on {" and ".join(left.variables)}.'
     )
+
+
+def _withdraw_daily(found: SearchResult) -> None:
+    """Remove a daily cycle if what the load does to the unit over hours explains more."""
+    if _DAILY not in found.model.names:
+        return
+    without, _ = improve(found.task, found.model.without(_DAILY), 3)
+    if likelier := likelier_than_the_hour(found.task, without):
+        found.model = without
+        found.near.pop(_DAILY, None)
+        found.evidence.pop(_DAILY, None)
+        found.reasons[_DAILY] = f'the {likelier} explains the power better'
 
 
 def _withdraw_small(found: SearchResult) -> None:

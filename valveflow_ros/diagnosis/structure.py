@@ -18,9 +18,9 @@ from scipy.ndimage import median_filter
 
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
-from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD
+from valveflow_ros.diagnosis.grids import DAY_S, FOLDS, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening
-from valveflow_ros.diagnosis.slow import half_hours, regressions
+from valveflow_ros.diagnosis.slow import Levels, Regression, half_hours, regressions
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
@@ -190,28 +190,65 @@ def _over_hours(task: Task, model: Extended, values: dict[str, FloatArray]) -> S
     time scale. Every two coefficients must gain the logarithm of the number of means in
     log-likelihood (Schwarz, Ann. Stat. 6, 1978).
     """
-    rows, each = task.rows, max(1, round(_MINUTE_S / task.grids.mean_s))
-    names, columns = [], []
-    for name, minute in values.items():
-        x = np.repeat(minute, each)
-        x = np.append(x, np.full(len(rows) - len(x), x[-1]))
-        knots = np.quantile(x[rows], np.linspace(0.02, 0.98, _SLOW_HATS))
-        if np.all(np.diff(knots) > 0.0):
-            names.append(name)
-            columns += [np.interp(x, knots, hat) for hat in np.eye(_SLOW_HATS)]
-    found = half_hours(task, model, rows, columns)
-    if not names or not found.enough:
+    columns = _slow_columns(task, values)
+    found, places, fits = _regressed(task, model, columns)
+    if not fits:
         return None
-    places = [range(k * _SLOW_HATS, (k + 1) * _SLOW_HATS) for k in range(len(names))]
-    none, *fits = regressions(found, [(), *places])
-    k = max(range(len(names)), key=lambda k: fits[k].likelihood)
+    none, *fits = fits
+    k = max(range(len(fits)), key=lambda k: fits[k].likelihood)
     gain = fits[k].likelihood - none.likelihood
     if gain <= 0.5 * _SLOW_HATS * float(np.log(len(found.power))):
         return None
     hats = found.free[:, places[k]]
     noise = np.einsum('ki,ij,kj->k', hats, fits[k].covariance, hats)
     explained = float(np.var(hats @ fits[k].coefficients) - noise.mean())
-    return Structure((names[k],), gain, float('inf'), explained)
+    return Structure((list(columns)[k],), gain, float('inf'), explained)
+
+
+def likelier_than_the_hour(task: Task, model: Extended) -> str:
+    """Return what changes over hours and explains the power better than the time of day; or ''.
+
+    A unit that runs by a daily programme repeats each day all that its load does to it. The
+    comparison is that of `structure` over hours; ``model`` has no daily cycle.
+    """
+    values = variables(task, model)
+    angle = 2.0 * np.pi * task.grids.means(task.grids.time_s) / DAY_S
+    day = {'time of day': [np.cos(angle), np.sin(angle)]}
+    columns = day | _slow_columns(task, {name: values[name] for name in _SLOW})
+    found, places, fits = _regressed(task, model, columns)
+    if not fits:
+        return ''
+    scores = [
+        fit.likelihood - 0.5 * len(place) * float(np.log(len(found.power)))
+        for fit, place in zip(fits[1:], places, strict=True)
+    ]
+    best = int(np.argmax(scores))
+    return list(columns)[best] if best else ''
+
+
+def _slow_columns(task: Task, values: dict[str, FloatArray]) -> dict[str, list[FloatArray]]:
+    """Return piecewise-linear basis functions (m,) of each variable, given by the minute."""
+    rows, each = task.rows, max(1, round(_MINUTE_S / task.grids.mean_s))
+    columns = {}
+    for name, minute in values.items():
+        x = np.repeat(minute, each)
+        x = np.append(x, np.full(len(rows) - len(x), x[-1]))
+        knots = np.quantile(x[rows], np.linspace(0.02, 0.98, _SLOW_HATS))
+        if np.all(np.diff(knots) > 0.0):
+            columns[name] = [np.interp(x, knots, hat) for hat in np.eye(_SLOW_HATS)]
+    return columns
+
+
+def _regressed(
+    task: Task, model: Extended, columns: dict[str, list[FloatArray]]
+) -> tuple[Levels, list[range], list[Regression]]:
+    """Regress half-hour means on nothing and on each group of columns; none if there are few."""
+    found = half_hours(task, model, task.rows, [c for group in columns.values() for c in group])
+    if not columns or not found.enough:
+        return found, [], []
+    ends = list(itertools.accumulate(len(group) for group in columns.values()))
+    places = [range(a, b) for a, b in itertools.pairwise([0, *ends])]
+    return found, places, regressions(found, [(), *places])
 
 
 def _tabulated(task: Task, series: FloatArray, values: dict[str, FloatArray]) -> Structure:
