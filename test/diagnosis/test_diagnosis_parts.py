@@ -34,7 +34,7 @@ from valveflow_ros.diagnosis.fitting import (
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
-from valveflow_ros.diagnosis.structure import structure, variables
+from valveflow_ros.diagnosis.structure import likelier_than_the_hour, structure, variables
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -283,9 +283,15 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
     for size, there in ((0.0, False), (0.8, True)):
         power = answer(grids, plain) + noise + size * np.sign(x - np.median(x))
         seen = replace(grids, power=power)
-        found = structure(Task(seen, grids.open_rows, whitening(seen, noise)), plain)
+        task = Task(seen, grids.open_rows, whitening(seen, noise))
+        found = structure(task, plain)
         assert found.there == there
         assert not there or HOURS_BEFORE in found.variables
+        # A plant with a daily programme repeats it each day.
+        assert bool(likelier_than_the_hour(task, plain)) == there
+    daily = np.cos(2.0 * np.pi * grids.means(grids.time_s) / 86_400.0)
+    task = replace(task, grids=replace(grids, power=answer(grids, plain) + noise + 2.0 * daily))
+    assert likelier_than_the_hour(task, plain) == ''
 
 
 def test_changes_that_are_none_have_even_chances_and_true_ones_small_ones():

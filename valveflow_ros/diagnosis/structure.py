@@ -223,7 +223,7 @@ def likelier_than_the_hour(task: Task, model: Extended) -> str:
         for fit, place in zip(fits[1:], places, strict=True)
     ]
     best = int(np.argmax(scores))
-    return list(columns)[best] if best else ''
+    return list(columns)[best] if best and scores[best] > 0.0 else ''
 
 
 def _slow_columns(task: Task, values: dict[str, FloatArray]) -> dict[str, list[FloatArray]]:
