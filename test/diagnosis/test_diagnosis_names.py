@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 from diagnosis_records import (
+    coarse_unit,
     diagnosed,
     masked,
     names,
@@ -18,7 +19,6 @@ from diagnosis_records import (
     rough_model,
     shifted_column,
     table,
-    unit,
 )
 from streams import needs_jit
 
@@ -31,7 +31,7 @@ from valveflow_ros.plant.unit import Noise, Programme
 from valveflow_ros.records import SampleTable, Signal
 
 pytestmark = needs_jit
-HALF_DAY_ROWS = 21_600
+HALF_DAY_ROWS = 10_800
 SHORT = 2.0  # days
 FULL_MW = 295.0  # where the curve of the paper's unit is flat
 
@@ -51,7 +51,7 @@ FULL_MW = 295.0  # where the curve of the paper's unit is flat
     ],
 )  # fmt: skip
 def test_a_hidden_effect_is_named_sized_and_worth_its_gain(effect, key, truth, at_full_load_mw):
-    samples = table(SHORT, 1, (effect,), unit())
+    samples = table(SHORT, 1, (effect,), coarse_unit())
     name = effect.partition(':')[0]
     if name == 'temperature':  # neither single rows nor the hour of the day decide a name
         samples = masked(samples, 0.01, 1)
@@ -132,7 +132,7 @@ COURSES = {
 def changed_slowly(what, days):
     """Return the first size told of a record that changed so, and the change, in MW."""
     course, words = COURSES[what]
-    samples = table(days, 11, (), unit())
+    samples = table(days, 11, (), coarse_unit())
     values = samples.values.copy()
     change = course(np.arange(len(values)) / len(values))
     values[:, Signal.GENERATED_POWER] *= 1.0 + change
@@ -216,10 +216,10 @@ def test_without_an_earlier_model_a_bend_is_no_cause():
 @pytest.mark.parametrize(
     ('tempting', 'days'),
     [
-        (unit(Noise(load_dependence=0.6)), SHORT),
-        pytest.param(unit(programme=Programme(temperature_pressure_correlation=0.8)), SHORT,
+        (coarse_unit(Noise(load_dependence=0.6)), SHORT),
+        pytest.param(coarse_unit(programme=Programme(temperature_pressure_correlation=0.8)), SHORT,
                      marks=pytest.mark.long),
-        (unit(Noise(wander_mw=1.0)), 4.0),  # some causes are judged after three days only
+        (coarse_unit(Noise(wander_mw=1.0)), 4.0),  # some causes are judged after three days only
     ],
     ids=['noise grows with load', 'temperature follows pressure', 'slow wander'],
 )  # fmt: skip
@@ -272,7 +272,7 @@ def test_a_fault_before_the_sensor_is_found_from_the_command():
 
 
 def test_a_short_record_without_command_and_changes_of_temperature_says_what_it_cannot_judge():
-    samples = table(0.6, 5, (), unit())
+    samples = table(0.6, 5, (), coarse_unit())
     values = samples.values.copy()
     values[:, Signal.MAIN_STEAM_TEMPERATURE] = 540.0
     values[:, Signal.VALVE_COMMAND] = np.nan
@@ -287,13 +287,13 @@ def test_a_short_record_without_command_and_changes_of_temperature_says_what_it_
 
 @pytest.mark.slow
 def test_the_name_goes_when_its_variable_is_shuffled():
-    samples = table(SHORT, 1, ('temperature:k=-0.0016',), unit())
+    samples = table(SHORT, 1, ('temperature:k=-0.0016',), coarse_unit())
     moved = shifted_column(samples, Signal.MAIN_STEAM_TEMPERATURE, 2 * HALF_DAY_ROWS)
     assert 'temperature' not in names(diagnose(record(moved), rough_model()))
 
 
 def test_a_record_in_which_nothing_moves_is_refused():
-    samples = table(0.6, 5, (), unit())
+    samples = table(0.6, 5, (), coarse_unit())
     values = samples.values.copy()
     values[:, Signal.VALVE_OPENING] = 70.0
     values[:, Signal.MAIN_STEAM_PRESSURE] = 12.0

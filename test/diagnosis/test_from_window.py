@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnosis_records import EXPONENT, STEP_S, record, rough_model, table, unit
+from diagnosis_records import COARSE_S, EXPONENT, coarse_unit, record, rough_model, table, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -56,9 +56,9 @@ def test_the_pressure_comes_back_as_it_was_read(rows: list[tuple[int, int]]) -> 
 @pytest.mark.slow
 def test_the_window_is_diagnosed_as_the_record_is() -> None:
     """The same rows from a file and from the running monitor give the same diagnosis."""
-    samples = table(1.02, 3, ('temperature:k=-0.004',), unit())
+    samples = table(1.02, 3, ('temperature:k=-0.004',), coarse_unit())
     monitor = Monitor(
-        Settings({'sample_period': STEP_S, 'refit_period': 80_000.0, 'refit_segments': 0})
+        Settings({'sample_period': COARSE_S, 'refit_period': 80_000.0, 'refit_segments': 0})
     )
     feed_rows(monitor, samples)
     curve = monitor.characteristic
@@ -70,7 +70,7 @@ def test_the_window_is_diagnosed_as_the_record_is() -> None:
         [(task.contents.time_ns[a], task.contents.time_ns[b - 1])
          for a, b, _ in task.contents.spans]
     )  # fmt: skip
-    record = Record(samples, STEP_S, curve.static_form, Settings().settle_s, spans)
+    record = Record(samples, COARSE_S, curve.static_form, Settings().settle_s, spans)
     truth = to_json(diagnose(record, curve.model))
     content = json.loads(found.text)
     assert found.window_end_ns == task.window_end_ns

@@ -124,7 +124,7 @@ def test_a_valve_at_its_stop_is_no_dead_transmitter(samples: SampleTable, level)
 )
 def test_means_of_a_minute_name_no_slack_of_another_size(effect: tuple[str, ...]) -> None:
     """A slack is found with an interval that holds the truth, or cannot be judged."""
-    plant = vf.simulate(5, 2, effect, unit='choked_fixed:number=2', recording='minute')
+    plant = vf.simulate(3, 2, effect, unit='choked_fixed:number=2', recording='minute')
     found = vf.diagnose(plant.log).diagnosis
     named = {c.name: c for c in found.causes}
     if 'backlash' in named:
@@ -168,6 +168,6 @@ def test_a_lag_that_its_error_exceeds_is_not_told() -> None:
 def test_the_rounded_curve_of_a_healthy_unit_is_no_cause(unit: str, true: set[str]) -> None:
     """Its law has another exponent than the paper's, which is true, and it follows the vacuum."""
     _, number = unit.split('=')
-    log = vf.simulate(5.0, int(number), [], unit=unit, recording='minute')
+    log = vf.simulate(3.0, int(number), [], unit=unit, recording='minute')
     found = vf.diagnose(log.to_dataframe(), covariates={'vacuum': 'condenser_pressure_kpa'})
     assert {c.name for c in found.diagnosis.causes} <= true

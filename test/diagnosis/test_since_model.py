@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_records import diagnosed, record, table, unit
+from diagnosis_records import coarse_unit, diagnosed, record, table
 from streams import needs_jit
 
 from valveflow_ros.diagnosis.causes import TO_DO
@@ -31,7 +31,7 @@ def model():
 
 def later(change):
     """Return a record of other days, its columns changed."""
-    samples = table(DAYS, LATER, (), unit())
+    samples = table(DAYS, LATER, (), coarse_unit())
     values = samples.values.copy()
     change(values)
     return record(replace(samples, values=values))
@@ -108,7 +108,7 @@ def test_a_change_of_the_whole_record_is_named_with_its_size(
 def test_a_change_of_the_curve_is_told_at_low_and_at_high_load(model):
     found = since(less_when_open, model)
     assert found.name == 'curve_change'
-    samples = table(DAYS, LATER, (), unit())
+    samples = table(DAYS, LATER, (), coarse_unit())
     power, opening = (samples.column(s) for s in (Signal.GENERATED_POWER, Signal.VALVE_OPENING))
     for name, share in (('low_load_mw', 0.05), ('high_load_mw', 0.95)):
         at = np.abs(power - np.nanquantile(power, share)) < 3.0
@@ -149,7 +149,7 @@ _STEP, _DRIFT = 'input_step:g=0.02,t0_days=1.2', 'gain_drift:g=0.08'
 )  # fmt: skip
 def test_a_change_within_the_record_is_told_from_one_before_it(model, change, effect):
     own = effect.partition(':')[0]
-    samples = table(DAYS, LATER, (effect,), unit())
+    samples = table(DAYS, LATER, (effect,), coarse_unit())
     values = samples.values.copy()
     change(values)
     found = diagnose(record(replace(samples, values=values)), model, given=True)
