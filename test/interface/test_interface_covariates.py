@@ -29,7 +29,7 @@ NIGHTLY = {
 
 @pytest.fixture(scope='module')
 def plant():
-    return vf.simulate(days=5, seed=3, unit='choked:number=3', recording='minute')
+    return vf.simulate(days=4, seed=3, unit='choked:number=3', recording='minute')
 
 
 @pytest.fixture(scope='module')
@@ -180,7 +180,7 @@ def test_without_the_column_a_drift_is_told(plant, without):
 @needs_jit
 def test_nothing_drifts_where_the_power_does_not_follow():
     unit = 'choked:number=3,vacuum_per_kpa=0'
-    sound = vf.simulate(days=5, seed=3, unit=unit, recording='minute')
+    sound = vf.simulate(days=4, seed=3, unit=unit, recording='minute')
     d = vf.diagnose(sound.to_dataframe(), covariates={'vacuum': COLUMN}).diagnosis
     assert 'vacuum' not in {c.name for c in d.causes}
     assert 'slow wander' in dict(d.rejected)['vacuum']

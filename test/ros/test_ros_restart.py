@@ -16,9 +16,9 @@ from valveflow_ros.ros.simulator_main import effects_of, stamped_steps
 from valveflow_ros.ros.verify import verify
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-LOG = simulate(0.13, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.1'])).table
+LOG = simulate(0.11, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.085'])).table
 # Rows at the fault, when its alarm has been raised for a while, and at the end.
-FAULT, RAISED, PLAYED = 8640, 10_400, 10_500
+FAULT, RAISED, PLAYED = 7344, 9104, 9204
 
 
 class Plant(Listener):

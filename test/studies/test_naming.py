@@ -186,10 +186,10 @@ def test_methods_name_what_is_large_in_the_format_and_baselines_nothing_in_a_hea
     None
 ):
     def frame(*effects: str) -> pd.DataFrame:
-        return vf.simulate(3.0, 5, effects).to_dataframe()
+        return vf.simulate(2.0, 5, effects).to_dataframe()
 
-    healthy, stepped = frame(), frame('gain_step:g=0.03,t0_days=1.8')
-    truth = {'a': {**TRUTH['a'], 'size': 0.03, 'onset_hours': 43.2}}
+    healthy, stepped = frame(), frame('gain_step:g=0.03,t0_days=1.2')
+    truth = {'a': {**TRUTH['a'], 'size': 0.03, 'onset_hours': 28.8}}
     for method, hours in (('valveflow', 0.1), ('changepoint', 1.0)):
         scored = scoring.score(truth, {'a': answers.METHODS[method](stepped)})
         assert (scored['all']['right'], scored['size']['given']) == (1, 1)
