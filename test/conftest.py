@@ -89,6 +89,11 @@ def leased_domain() -> Iterator[int]:
     pytest.fail(f'all {DOMAINS} ROS domains are held by other tests on this machine')
 
 
+# The first of these compiles most of what is compiled. The others hardly need it and take as long,
+# so that on two cores nothing is compiled twice.
+FIRST = ('test_from_window.py', 'test_opcua_link.py', 'test_page_browser.py')
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """On several cores begin with the files that take long, so that none is left at the end."""
     if not os.environ.get('VALVEFLOW_SLOW'):
@@ -97,7 +102,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=left)
     if hasattr(config, 'workerinput'):
         long = {item.path for item in items if item.get_closest_marker('slow')}
-        items.sort(key=lambda item: item.path not in long)
+        rank = {name: k for k, name in enumerate(FIRST)}
+        items.sort(key=lambda item: (rank.get(item.path.name, len(FIRST)), item.path not in long))
 
 
 @pytest.fixture

@@ -99,7 +99,7 @@ def runs_what_it_reads(text: str) -> list[str]:
         elif isinstance(node, ast.Call):
             given = {word.arg: ast.unparse(word.value) for word in node.keywords}
             found += [k for k in ('shell', 'allow_pickle') if given.get(k, 'False') != 'False']
-            called = ast.unparse(node.func)
+            called = ast.unparse(node.func) if getattr(node.func, 'attr', '') == 'load' else ''
             # The default of NumPy is False, and is to be seen to be.
             if called in ('np.load', 'numpy.load') and 'allow_pickle' not in given:
                 found.append(called)

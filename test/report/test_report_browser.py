@@ -14,8 +14,8 @@ from dataclasses import replace
 import pytest
 from report_stories import diagnosed, history
 
-from valveflow_ros.cli.main import main
 from valveflow_ros.interface.compare import compare, validate
+from valveflow_ros.interface.simulate import simulate
 from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.identification import identification_page
 
@@ -35,9 +35,9 @@ def made_pages(identified):
 
 def judged_pages(folder):
     """Three methods on ten hours of the paper's plant, and its curve held against them."""
-    log, truth = folder / 'plant.mcap', folder / 'truth.json'
-    words = ['simulate', '-o', log, '--days', '0.4', '--seed', '1', '--truth', truth, '--quiet']
-    assert main([str(word) for word in words]) == 0
+    plant, truth = simulate(0.4, 1), folder / 'truth.json'
+    plant.write(folder / 'plant.mcap', truth=truth)
+    log = plant.to_dataframe()[::4]
     quick = {'refine': False, 'selection_rule': 'paper'}
     found = compare(log, truth=truth, parameters=quick)
     checked = validate(log, found.comparison.characteristic)

@@ -66,8 +66,8 @@ def test_a_topic_is_named_recorded_replayed_and_kept_by_the_state(processes, lis
     # Health is published five times a second: a state as young as that has all of these samples.
     begun_s, age = time.monotonic(), 'Seconds since it was saved'
     listener.until(
-        lambda: time.monotonic() > begun_s + 3.0
-        and float(listener.value('state', age) or 9) < 2.0,
+        lambda: time.monotonic() > begun_s + 2.0
+        and float(listener.value('state', age) or 9) < 1.5,
         'a saved state',
     )  # fmt: skip
     monitor.kill()

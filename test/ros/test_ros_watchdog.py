@@ -204,7 +204,7 @@ def test_who_counts_as_alive(supervisor):
 def test_a_monitor_that_is_held_up_anywhere_pings_no_more(processes, supervisor, tmp_path):
     monitor = processes.start(
         'hurt_monitor', '--ros-args', '-p', f'record_directory:={tmp_path / "rec"}',
-        '-p', 'diagnostics_period:=0.05', '-p', 'record_flush:=0.05',
+        '-p', 'diagnostics_period:=0.1', '-p', 'record_flush:=0.05',
         **supervisor.environment(usec=round(2e6 * PERIOD_S)),
         PYTHONPATH=f'{HERE}{os.pathsep}{os.environ.get("PYTHONPATH", "")}',
     )  # fmt: skip
