@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_helpers import PATIENCE_S, wait_until
+from ros_helpers import PATIENCE_S, spin_until
 from std_srvs.srv import Trigger
 from valveflow_msgs.msg import Alarm, FlowCharacteristic
 
@@ -43,9 +43,7 @@ class Listener:
 
     def until(self, condition, what, patience_s=PATIENCE_S):
         """Listen until something holds; return it."""
-        return wait_until(
-            lambda: self.executor.spin_once(timeout_sec=0.02) or condition(), what, patience_s
-        )
+        return spin_until(self.executor, condition, what, patience_s)
 
     def quiet(self, seconds):
         """Listen for a while."""

@@ -13,14 +13,21 @@ PATIENCE_S = 240.0
 LOOPBACK = '127.0.0.1'
 
 
-def wait_until(condition, what, patience_s=PATIENCE_S):
+def wait_until(condition, what, patience_s=PATIENCE_S, pause_s=0.01):
     """Return what a condition gives once it is true; fail after a generous while."""
     end_s = time.monotonic() + patience_s
     while not (found := condition()):
         if time.monotonic() > end_s:
             pytest.fail(f'{what} did not come within {patience_s:g} s')
-        time.sleep(0.01)
+        time.sleep(pause_s)
     return found
+
+
+def spin_until(executor, condition, what, patience_s=PATIENCE_S):
+    """Wait as `wait_until` does, while an executor calls what has come."""
+    return wait_until(
+        lambda: executor.spin_once(timeout_sec=0.02) or condition(), what, patience_s, 0.0
+    )
 
 
 class Processes:

@@ -21,7 +21,7 @@ from opcua_server import (
 )
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from ros_helpers import wait_until
+from ros_helpers import spin_until, wait_until
 from test_ros_watch import AT_S, Speaker
 from valveflow_msgs.msg import Alarm, PlantSample
 
@@ -61,7 +61,7 @@ class Hearing:
             self.values[status.name] = {pair.key: pair.value for pair in status.values}
 
     def until(self, condition, what):
-        wait_until(lambda: self._executor.spin_once(timeout_sec=0.05) or condition(), what, 60.0)
+        spin_until(self._executor, condition, what, 60.0)
 
     def last(self, unit):
         return self.samples[unit][-1] if self.samples[unit] else None

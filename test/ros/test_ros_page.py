@@ -12,7 +12,7 @@ import urllib.request
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
-from ros_helpers import wait_until
+from ros_helpers import spin_until, wait_until
 from test_ros_watch import Speaker
 from valveflow_msgs.srv import OperateAlarm
 
@@ -123,7 +123,7 @@ def test_every_monitor_is_shown_asked_and_told_of(context, speaker, processes, p
     thread = threading.Thread(target=ask)
     thread.start()
 
-    wait_until(lambda: executor.spin_once(timeout_sec=0.05) or answers, 'the answer', 30.0)
+    spin_until(executor, lambda: answers, 'the answer', 30.0)
     thread.join()
     executor.shutdown()
     assert asked == [('shelve', 'curve_shift')]

@@ -11,7 +11,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from ros_helpers import wait_until
+from ros_helpers import spin_until, wait_until
 
 from valveflow_ros.errors import ParameterError
 from valveflow_ros.interface.settings import unmatched_files
@@ -261,7 +261,7 @@ def ask(context, running):
             clients[name] = asking.create_client(kind, f'/valveflow_monitor/{name}')
             wait_until(clients[name].service_is_ready, 'the service', 20.0)
         future = clients[name].call_async(request)
-        wait_until(lambda: executor.spin_once(timeout_sec=0.05) or future.done(), name, 60.0)
+        spin_until(executor, future.done, name, 60.0)
         return future.result()
 
     yield answer
