@@ -35,7 +35,7 @@ typesys = pytest.importorskip('rosbags.typesys')
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 TAKEN = 'Samples taken in all runs'
-DAYS, SEED, FAULT_DAYS = 0.14, 7, 0.1
+DAYS, SEED, FAULT_DAYS = 0.22, 7, 0.17
 FAULT = f'gain_step:g=-0.12,t0_days={FAULT_DAYS}'
 FAULT_NS = DEFAULT_START_NS + round(FAULT_DAYS * 86400e9)
 SENT = [Signal.VALVE_COMMAND, *(info.signal for info in SIGNALS if info.required)]
@@ -234,13 +234,13 @@ def a_changed_recording_is_noticed(log, folder):
             for message in log.iter_messages():
                 data = message.data
                 count += message.topic == name
-                if message.topic == name and count == 7600:
+                if message.topic == name and count == 12000:
                     # The low end of the number that stands last in either message.
                     data = data[:-8] + bytes([data[-8] ^ 1]) + data[-7:]
-                if count > 7700:
+                if count > 12100:
                     break
                 writer.write(message.topic, data, message.log_time_ns, message.publish_time_ns)
         result = verify(place)
         assert not result.identical
-        assert 'Prediction number 7600 differs' in result.difference
+        assert 'Prediction number 12000 differs' in result.difference
         assert field in result.difference
