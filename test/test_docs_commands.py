@@ -222,7 +222,7 @@ def short_pages(
 
 @pytest.mark.ros
 @pytest.mark.slow
-@pytest.mark.parametrize('name', ['live', pytest.param('opcua', marks=pytest.mark.long)])
+@pytest.mark.parametrize('name', ['live', 'opcua'])
 def test_the_live_tutorials_work(
     name: str, short_pages: dict[str, Future[int]], tmp_path: Path,
     ros_environment: dict[str, str],

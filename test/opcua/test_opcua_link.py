@@ -84,7 +84,7 @@ class Running:
 def run(tmp_path, monkeypatch):
     """A function that starts a link; it is ended after the test."""
     for module in ('link', 'session'):
-        monkeypatch.setattr(f'valveflow_ros.opcua.{module}.ANSWER_S', 1.0)
+        monkeypatch.setattr(f'valveflow_ros.opcua.{module}.ANSWER_S', 2.0)
     with contextlib.ExitStack() as stack:
 
         def start(content):
