@@ -325,6 +325,24 @@ def test_where_something_else_acts_a_gain_is_held_against_all_that_was_tried():
     assert chance_of_gain(there + 0.9 * effect, there, part, tried=18) == min(1.0, 18 * few)
 
 
+@pytest.mark.parametrize('step_s', [2.0, 5.0, 10.0])
+def test_readings_that_repeat_by_chance_are_no_flatline_and_longer_ones_are(step_s):
+    rng = np.random.default_rng(7)
+    samples = table(0.4, 2, (), unit(step_s=step_s))
+    values = samples.values.copy()
+    for share in (0.1, 0.3, 0.5):  # of rows that read as the row before
+        fresh = rng.random(len(values)) >= share
+        place = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0))
+        values[:, Signal.MAIN_STEAM_TEMPERATURE] = rng.normal(540.0, 1.0, len(values))[place]
+        _, found = record_faults.faults(replace(samples, values=values), step_s)
+        assert 'flatline' not in {f.name for f in found}
+        held = values.copy()
+        held[1000:1060, Signal.MAIN_STEAM_TEMPERATURE] = 541.0
+        bad, found = record_faults.faults(replace(samples, values=held), step_s)
+        assert [f.name for f in found] == ['flatline']
+        assert set(np.flatnonzero(bad[:, Signal.MAIN_STEAM_TEMPERATURE])) >= set(range(1002, 1059))
+
+
 def test_faults_are_masked_where_they_are():
     samples = table(0.4, 2, (), unit())
     bad, found = record_faults.faults(samples, 2.0)

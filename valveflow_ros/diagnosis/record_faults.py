@@ -20,6 +20,7 @@ _SPIKE_WINDOW, _SPIKE_SD, _LONGEST_SPIKE = 11, 6.0, 1
 _SPIKE_SHARE, _LEAST_SPIKES, _LEAST_HEIGHT = 0.01, 4, 0.01
 _NOISE_ROWS = 3600
 _BACK_SHARE = 0.6
+_FLAT_CHANCE = 1e-6
 _LEAP_ROWS, _LEAP_SD = 200, 4.2
 _COARSE_SHARE = 0.3
 
@@ -85,6 +86,10 @@ def _flat(x: FloatArray, step_s: float, rests: BoolArray | None = None) -> tuple
     bad = np.zeros(len(x), dtype=bool)
     usual = float(np.quantile(length, 0.99))
     least = max(FLAT_LEAST_S / step_s, _FLAT_FACTOR * usual, 4.0)
+    # A coarse reading repeats itself: n rows have a run of L by chance with about n q^L.
+    repeated = 1.0 - len(length) / len(x)
+    if 0.0 < repeated < 1.0:
+        least = max(least, np.log(_FLAT_CHANCE / len(x)) / np.log(repeated))
     long = length >= least
     if rests is not None:
         long &= ~rests[first]
