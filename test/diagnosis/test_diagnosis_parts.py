@@ -448,5 +448,7 @@ def test_a_cause_in_doubt_hides_no_other(
     monkeypatch.setattr(search, '_without_onset', lambda *_: '')
     monkeypatch.setattr(search, '_small', doubt)
     monkeypatch.setattr(search, 'weigh', weigh)
-    assert not _add(SearchResult(None, model, model, model), set())  # type: ignore[arg-type]
+    monkeypatch.setattr(search, 'improve', lambda task, model, steps: (model, 1.0))
+    task = SimpleNamespace(cost=lambda model: 1.0)
+    assert not _add(SearchResult(task, model, model, model), set())  # type: ignore[arg-type]
     assert seen == weighed
