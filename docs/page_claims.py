@@ -46,9 +46,9 @@ _COVERAGE = {
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_51300_51302', 'null_47000_47099'
+_HIDDEN, _NULL = 'hidden_52300_52302', 'null_52000_52099'
 _PAIRS, _TRIPLES = 'pair_51000_51003', 'triple_50100_50105'
-_SMALL = 'diagnosis_hidden_51600_51601_5d'
+_SMALL = 'diagnosis_hidden_52600_52601_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
     'every second': 'thermal_names_1s_3501_3517',
@@ -173,14 +173,14 @@ def _diagnosis() -> list[Row]:
     for name, question in (
         (_HIDDEN, 'one hidden effect: named, and no other'),
         (_NULL, 'nothing wrong: nothing named, and nothing said to be unexplained'),
-        ('slow_51200_51203',
+        ('slow_52200_52203',
          'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
          'may be named): told as a change in time, and nothing named'),
         ('confounded_47300_47303', 'two causes that look alike'),
         (_PAIRS, 'two causes at once: both named'),
         (_TRIPLES, 'three causes at once: all named'),
-        ('outside_51500_51501', 'effects outside the catalogue: none named'),
+        ('outside_53500_53501', 'effects outside the catalogue: none named'),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
         text = f'{r["right"]} of {r["records"]}'
