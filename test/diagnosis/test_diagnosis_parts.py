@@ -420,6 +420,15 @@ def test_a_record_of_minutes_is_refused():
         make_grids(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
 
 
+@pytest.mark.parametrize(('onset', 'early'), [(0.01, True), (0.2, False)])
+def test_a_change_that_begins_with_the_record_is_in_doubt(grids, onset, early):
+    added = FittedCause(catalogue()['gain_step'], (0.01, onset))
+    model = Extended(rough_model()).with_cause(added)
+    noise = np.random.default_rng(1).normal(0.0, 1.0, len(grids.power))
+    task = Task(replace(grids, power=answer(grids, model) + noise), grids.whole, np.zeros(ORDER))
+    assert bool(search._doubt(task, Rival(model, added, 0.0))) == early
+
+
 @pytest.mark.parametrize(('doubted', 'weighed'), [
     ({'curve_shape'}, ['choked', 'exponent']),  # saturation explains too much less
     (set(), ['curve_shape']),

@@ -56,7 +56,7 @@ def nuisance(task: Task, model: Extended) -> FloatArray:
 
 HATS = 13
 _SECANT = 0.004
-_EDGE_SHARE = 0.04
+EDGE_SHARE = 0.04  # of the record, at each end: a change there cannot be dated
 _STEPS = 5
 GAIN, INPUT, OFFSET, CURVE = 0, 1, 2, 3  # carriers (basic effects); the curve has HATS of them
 
@@ -179,7 +179,7 @@ class Screening:
         good = own > 1e-6 * whole
         found = np.where(good, toward / np.where(good, own, 1.0), 0.0)
         gains = found * toward / (2.0 * self.variance)
-        margin = max(1, round(_EDGE_SHARE * self.grids.subs))
+        margin = max(1, round(EDGE_SHARE * self.grids.subs))
         gains[:margin] = gains[-margin:] = 0.0
         return gains, found
 

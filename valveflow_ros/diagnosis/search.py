@@ -23,8 +23,8 @@ from valveflow_ros.diagnosis.fitting import (
     search_lines,
     settle,
 )
-from valveflow_ros.diagnosis.grids import Grids
-from valveflow_ros.diagnosis.screening import Screening
+from valveflow_ros.diagnosis.grids import DAY_S, Grids
+from valveflow_ros.diagnosis.screening import EDGE_SHARE, Screening
 from valveflow_ros.errors import TooFewSamplesError, listed
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
@@ -394,13 +394,18 @@ def add_of_family(found: SearchResult, family: str) -> bool:
 
 
 def _without_onset(task: Task, rival: Rival) -> str:
-    """Return why a change is no change in time: without its onset it explains as much; or ''.
+    """Return why a change is no change in time; or ''.
 
-    It is then an error of the curve itself, in a record that begins with other loads.
+    If it begins with the record, or explains as much without its onset, it is an error of the
+    curve itself, in a record that begins with other loads.
     """
     unknowns = rival.added.cause.unknowns
-    if not any(u.dated for u in unknowns):
+    onsets = [v for u, v in zip(unknowns, rival.added.values, strict=True) if u.dated]
+    if not onsets:
         return ''
+    days = len(task.grids.power) * task.grids.mean_s / DAY_S
+    if min(onsets) < EDGE_SHARE * days:
+        return 'it would begin with the record, which does not show the time before'
     values = tuple(
         0.0 if u.dated else v for u, v in zip(unknowns, rival.added.values, strict=True)
     )
