@@ -620,16 +620,20 @@ def _withdraw(found: SearchResult, rest: _Rest) -> _Rest:
     slow = rest.disturbance
     if slow is None:
         return rest
-    for a in found.model.active:
+    before = found.model
+    for a in before.active:
         if a.cause.slow and not _explained(found, a.name) > _FAR_MORE * slow.rms_mw**2:
             found.model = found.model.without(a.name)
             found.near.pop(a.name, None)
             found.reasons[a.name] = _OF_SHAPE[
                 NO_SHAPE if rest.course is None else rest.course.name
             ]
+    withdrawn = found.model is not before
     found.model, _ = improve(found.task, found.model, 3)
-    # The effect that these causes explained now belongs to the drift.
-    return replace(rest, drift=drift(found.task, found.model))
+    # The effect that these causes explained now belongs to the slow change, which was measured
+    # beside them.
+    course = _course(found, again=False) if withdrawn and rest.course else rest.course
+    return replace(rest, drift=drift(found.task, found.model), course=course)
 
 
 def _explained(found: SearchResult, name: str) -> float:
