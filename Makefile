@@ -33,7 +33,9 @@ ENV := source ./env.sh &&
 VALVEFLOW_DEMO ?= bash -c 'source env.sh && python -m valveflow_ros.ros.demo --output demo_output'
 PYTEST_ARGS ?=
 # A file's tests stay together, for they share what is dear to make; the long files come first.
-PARALLEL ?= -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# Many tests wait for other processes, so there are more workers than cores.
+WORKERS := $(shell cores=$$(nproc); echo $$((cores + cores / 2)))
+PARALLEL ?= -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTHONS ?= python3.10 python3.12
 # Checked as strictly as mypy can; ros/ is not, because rclpy carries no annotations.
 STRICT := $(wildcard $(addprefix valveflow_ros/,*.py signals segments partition curve fit \
