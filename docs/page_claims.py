@@ -180,7 +180,7 @@ def _diagnosis() -> list[Row]:
         ('confounded_47300_47303', 'two causes that look alike'),
         (_PAIRS, 'two causes at once: both named'),
         (_TRIPLES, 'three causes at once: all named'),
-        ('outside_53500_53501', 'effects outside the catalogue: none named'),
+        ('outside_54500_54501', 'effects outside the catalogue: none named'),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
         text = f'{r["right"]} of {r["records"]}'

@@ -19,6 +19,7 @@ from diagnosis_records import (
     rough_model,
     shifted_column,
     table,
+    unit,
 )
 from streams import needs_jit
 
@@ -179,7 +180,7 @@ def test_every_shape_is_told(what):
     ],
 )
 def test_every_family_is_told_from_the_others(effect):
-    found = diagnosed(effect)
+    found = diagnosed(effect, of=unit())  # with rows 4 s apart the drift is not confirmed
     assert names(found) == {effect.partition(':')[0]}
 
 
