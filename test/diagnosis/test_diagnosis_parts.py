@@ -34,7 +34,7 @@ from valveflow_ros.diagnosis.fitting import (
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
-from valveflow_ros.diagnosis.structure import likelier_than_the_hour, structure, variables
+from valveflow_ros.diagnosis.structure import likelier_than_time_of_day, structure, variables
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -288,10 +288,10 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
         assert found.there == there
         assert not there or HOURS_BEFORE in found.variables
         # A plant with a daily programme repeats it each day.
-        assert bool(likelier_than_the_hour(task, plain)) == there
+        assert bool(likelier_than_time_of_day(task, plain)) == there
     daily = np.cos(2.0 * np.pi * grids.means(grids.time_s) / 86_400.0)
     task = replace(task, grids=replace(grids, power=answer(grids, plain) + noise + 2.0 * daily))
-    assert likelier_than_the_hour(task, plain) == ''
+    assert likelier_than_time_of_day(task, plain) == ''
 
 
 def test_changes_that_are_none_have_even_chances_and_true_ones_small_ones():

@@ -67,7 +67,7 @@ from valveflow_ros.diagnosis.structure import (
     Period,
     Structure,
     Wander,
-    likelier_than_the_hour,
+    likelier_than_time_of_day,
     period,
     structure,
     wander,
@@ -573,7 +573,7 @@ def _withdraw_daily(found: SearchResult) -> None:
     if _DAILY not in found.model.names:
         return
     without, _ = improve(found.task, found.model.without(_DAILY), 3)
-    if likelier := likelier_than_the_hour(found.task, without):
+    if likelier := likelier_than_time_of_day(found.task, without):
         found.model = without
         found.near.pop(_DAILY, None)
         found.evidence.pop(_DAILY, None)

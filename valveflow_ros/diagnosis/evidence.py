@@ -350,7 +350,7 @@ def gain_of_form(task: Task, model: Extended, task_new: Task, new: Extended) -> 
 def chance_of_gain(
     before: FloatArray, after: FloatArray, part: IntArray, tried: int = 1, tested: int = 1
 ) -> float:
-    """Return the p-value of the gain of one model over another on rows to which none was fitted.
+    """Return the p-value of the gain of one model over another on rows that neither was fitted to.
 
     The score of a part (half an hour) is the sum of residual before times its change. A model
     fitted to other rows is independent of the noise here, so the score has mean 0 if the change is

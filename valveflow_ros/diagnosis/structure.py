@@ -205,7 +205,7 @@ def _over_hours(task: Task, model: Extended, values: dict[str, FloatArray]) -> S
     return Structure((list(columns)[k],), gain, float('inf'), explained)
 
 
-def likelier_than_the_hour(task: Task, model: Extended) -> str:
+def likelier_than_time_of_day(task: Task, model: Extended) -> str:
     """Return what changes over hours and explains the power better than the time of day; or ''.
 
     A unit that runs by a daily programme repeats each day all that its load does to it. The
