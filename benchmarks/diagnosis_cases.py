@@ -218,13 +218,13 @@ def confounded(label: str, seed: int, days: float, times: tuple[float, float]) -
     return replace(case, kind='confounded', label=label, unit=unit, given=given)
 
 
-LEAST_SHARE, LARGEST_SHARE = 0.33, 0.6  # of the noise's sd: 11 to 36 % of its variance
+def outside(label: str, seed: int, shares: tuple[float, float]) -> Case:
+    """Return a plant with something in its record that no cause of the catalogue explains.
 
-
-def outside(label: str, seed: int) -> Case:
-    """Return a plant with something in its record that no cause of the catalogue explains."""
+    Its standard deviation is a share of that of the noise, drawn between two limits.
+    """
     rng = np.random.default_rng([seed, len(label)])
-    share = float(rng.uniform(LEAST_SHARE, LARGEST_SHARE))
+    share = float(rng.uniform(*shares))
     return Case('outside', label, seed, _unit(rng), outside_share=share)
 
 

@@ -152,7 +152,10 @@ def cases(given: argparse.Namespace) -> list[Case]:
     own = given.days, (given.low, given.high)
     make = {
         'null': lambda seed: [plants.null(seed)],
-        'outside': lambda seed: [plants.outside(label, seed) for label in OUTSIDE],
+        'outside': lambda seed: [
+            plants.outside(label, seed, (given.least_share, given.largest_share))
+            for label in OUTSIDE
+        ],
         'slow': lambda seed: [plants.slow(label, seed) for label in SLOW],
         'confounded': lambda seed: [
             plants.confounded(label, seed, *own) for label in plants.CONFOUNDED
@@ -188,6 +191,8 @@ def counts(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def main() -> None:
     parser = study.options(__doc__, seeds=1, first=0, days=10.0, low=2.0, high=4.0)
     parser.add_argument('--kind', choices=KINDS, default='hidden')
+    parser.add_argument('--least-share', type=float, default=0.33)
+    parser.add_argument('--largest-share', type=float, default=0.6)
     parser.add_argument('--effect', action='append')
     parser.add_argument('--recording', choices=('1s', 'minute'), default='1s')
     given = parser.parse_args()

@@ -233,6 +233,7 @@ _SHAPES = {
 }  # fmt: skip
 # Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
 _ANOTHER_SHAPE = 6.0
+_MOST_LEVELS = 2  # causes that change the level in time; more of them imitate any slow change
 _FAMILIES = ('drift', 'step')  # families of causes that are also shapes
 _LEAST_SHAPE = 5.0  # the same for a shape over a slow disturbance without a shape
 _LAST_STEPS = 10  # breakpoints converge slowly near a bump
@@ -475,14 +476,22 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
         mine = (NAMED_SHAPE, *_SHAPES.get(families, ()))
     best = max((c for c in tried.values() if c.name not in mine), key=lambda c: c.score)
     if names:
+        better = best.score - max(tried[shape].score for shape in mine)
         least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
-        if best.score - max(tried[shape].score for shape in mine) <= least:
+        so_many = len(names) > _MOST_LEVELS
+        if not so_many and better <= least:
+            if better > 0.0 and best.name != NO_SHAPE:
+                words = course_words(best, found.task.grids.start_ns)
+                found.other_shape = (
+                    f'Instead of {listed(names)} the power may change in time {words}: this fits '
+                    'the data as well.'
+                )
             return None
         for name in names:
             found.model = found.model.without(name)
             found.evidence.pop(name, None)
             found.near.pop(name, None)
-            found.reasons[name] = _OF_SHAPE[best.name]
+            found.reasons[name] = _SO_MANY if so_many else _OF_SHAPE[best.name]
         found.model, _ = improve(found.task, found.model, 3)
         other_family = again and best.name in _FAMILIES and best.name not in families
         if other_family and add_of_family(found, best.name):
@@ -506,7 +515,9 @@ _OF_SHAPE = {
     'drift and back': 'a drift that ends at once fits better',
     'there and back': 'a change that is undone later fits better',
     'two steps': 'two steps in time fit better',
+    'drift and two steps': 'a drift with two steps fits better',
 }
+_SO_MANY = 'so many changes in time together would imitate any slow change'
 
 
 def course_words(course: Course, start_ns: int) -> str:
@@ -534,6 +545,11 @@ def course_words(course: Course, start_ns: int) -> str:
         return f'evenly, {mw[0]} until about {at[0]}, and then back at once'
     if course.name == 'there and back':
         return f'by {mw[0]} from about {at[0]} to {at[1]}'
+    if course.name == 'drift and two steps':
+        return (
+            f'evenly, {mw[0]} over the record, and besides by {mw[1]} about {at[0]} and by '
+            f'{mw[2]} about {at[1]}'
+        )
     return f'by {mw[0]} about {at[0]} and by {mw[1]} about {at[1]}'
 
 
@@ -629,6 +645,8 @@ def _withdraw(found: SearchResult, rest: _Rest) -> _Rest:
                 NO_SHAPE if rest.course is None else rest.course.name
             ]
     withdrawn = found.model is not before
+    if withdrawn:
+        found.other_shape = ''
     found.model, _ = improve(found.task, found.model, 3)
     # The effect that these causes explained now belongs to the slow change, which was measured
     # beside them.
@@ -759,8 +777,10 @@ def _conclude(
         final=final.without_causes() if dropped else final,
         reference=grids.reference, mean_s=grids.mean_s,
         notes=tuple(
-            note for note in (*notes(grids), *_of_covariates(models[-1]), rest.own_misfit, alike)
-            if note
+            note for note in (
+                *notes(grids), *_of_covariates(models[-1]), rest.own_misfit, alike,
+                '' if dropped else found.other_shape,
+            ) if note
         ),
     )  # fmt: skip
     return replace(result, sentence=_sentence(result))

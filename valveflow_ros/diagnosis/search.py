@@ -181,6 +181,8 @@ class SearchResult:
         Number of causes tried.
     rough : Grids, optional
         The record with longer model rows, for screening.
+    other_shape : str
+        Words for a change in time that fits as well as the named ones; empty if there is none.
     """
 
     task: Task
@@ -192,6 +194,7 @@ class SearchResult:
     reasons: dict[str, str] = field(default_factory=dict)
     tried: int = 0
     rough: Grids | None = None
+    other_shape: str = ''
 
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'

@@ -329,8 +329,8 @@ class Course:
     ----------
     name : str
         'drift', 'step', 'late drift', 'exponential', 'drift and step', 'drift and back',
-        'there and back', 'two steps'; `NO_SHAPE` for a wander alone and `NAMED_SHAPE` for
-        the named causes.
+        'there and back', 'two steps', 'drift and two steps'; `NO_SHAPE` for a wander alone and
+        `NAMED_SHAPE` for the named causes.
     score : float
         Log-likelihood minus the penalty for its parameters.
     mw : tuple of float
@@ -482,6 +482,17 @@ def _scored(
             chosen = int(one[j]), int(two[j])
             score = worth(gain) - 4 * PENALTY - more
             yield 'two steps', float(score[j]), chosen, np.array([a[j], b[j]])
+            # The same two steps beside a drift: what they explain of its rest.
+            along = gram[:, drift_at] / size[drift_at]
+            gain, a, b = _pairs(
+                gram - np.outer(along, gram[drift_at]), toward - along * toward[drift_at], one, two
+            )
+            j = int(gain.argmax())
+            even = toward[drift_at] - a[j] * gram[drift_at, one[j]] - b[j] * gram[drift_at, two[j]]
+            score = worth(gain + toward[drift_at] ** 2 / size[drift_at]) - 5 * PENALTY - more
+            sizes = np.array([even / size[drift_at], a[j], b[j]])
+            three = drift_at, int(one[j]), int(two[j])
+            yield 'drift and two steps', float(score[j]), three, sizes
             # The same two steps with equal size and opposite sign.
             square = np.maximum(gram[one, one] + gram[two, two] - 2.0 * gram[one, two], 1e-12)
             less = toward[one] - toward[two]
