@@ -229,7 +229,7 @@ _LEVELS = (
 )  # fmt: skip
 _SHAPES = {
     ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
-    ('drift', 'drift'): ('drift',), ('hidden',): ('there and back',),
+    ('drift', 'drift'): ('drift',),
 }  # fmt: skip
 # Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
 _ANOTHER_SHAPE = 6.0

@@ -265,7 +265,7 @@ _SWITCH_PENALTY = 9.0
 _FIRST_SIZES = (0.003, 0.008, 0.02)
 _FIRST_SHARE = 0.3
 _ROUNDS = 8
-_LEAST_SWITCHES = 2
+_LEAST_SWITCHES = 3  # on twice: once is a change that is undone, which many things can be
 
 
 def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
