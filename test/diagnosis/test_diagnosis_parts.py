@@ -34,7 +34,7 @@ from valveflow_ros.diagnosis.fitting import (
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
 from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
-from valveflow_ros.diagnosis.structure import likelier_than_time_of_day, structure, variables
+from valveflow_ros.diagnosis.structure import likelier_over_hours, structure, variables
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -280,6 +280,7 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
     rng, keep = np.random.default_rng(seed), np.exp(-grids.mean_s / (6.0 * 3600.0))
     wander = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(0.0, 0.5, len(x)))
     noise = wander + rng.normal(0.0, 1.0, len(x))
+    daily = np.cos(2.0 * np.pi * grids.means(grids.time_s) / 86_400.0)
     for size, there in ((0.0, False), (0.8, True)):
         power = answer(grids, plain) + noise + size * np.sign(x - np.median(x))
         seen = replace(grids, power=power)
@@ -288,10 +289,9 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
         assert found.there == there
         assert not there or HOURS_BEFORE in found.variables
         # A plant with a daily programme repeats it each day.
-        assert bool(likelier_than_time_of_day(task, plain)) == there
-    daily = np.cos(2.0 * np.pi * grids.means(grids.time_s) / 86_400.0)
+        assert bool(likelier_over_hours(task, plain, daily, 2)) == there
     task = replace(task, grids=replace(grids, power=answer(grids, plain) + noise + 2.0 * daily))
-    assert likelier_than_time_of_day(task, plain) == ''
+    assert likelier_over_hours(task, plain, daily, 2) == ''
 
 
 def test_changes_that_are_none_have_even_chances_and_true_ones_small_ones():

@@ -67,7 +67,7 @@ from valveflow_ros.diagnosis.structure import (
     Period,
     Structure,
     Wander,
-    likelier_than_time_of_day,
+    likelier_over_hours,
     period,
     structure,
     wander,
@@ -221,7 +221,7 @@ _LEAST_EXPLAINED = 0.001
 # A slack shows at reversals only, where the straight pieces of a healthy valve matter less: fixed
 # on the sets 88001 and 89001 of `benchmarks.naming`, where false ones explained up to 0.0003.
 _LEAST_SLACK = 0.0004
-_BEND, _DAILY = 'curve_shape', 'diurnal'
+_BEND = 'curve_shape'
 # Causes that change the level of the power in time, and equivalent shapes, by their families.
 _LEVELS = (
     'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
@@ -365,7 +365,7 @@ def diagnose(
             since = left
     progress(0.7, 'the sealed blocks')
     confirm(found)
-    _withdraw_daily(found)
+    _withdraw_imitations(found)
     _withdraw_small(found)
     found.model = _dated(found)
     progress(0.8, 'what is left')
@@ -584,16 +584,18 @@ def _own_misfit(found: SearchResult, left: Structure) -> str:
     )
 
 
-def _withdraw_daily(found: SearchResult) -> None:
-    """Remove a daily cycle if what the load does to the unit over hours explains more."""
-    if _DAILY not in found.model.names:
-        return
-    without, _ = improve(found.task, found.model.without(_DAILY), 3)
-    if likelier := likelier_than_time_of_day(found.task, without):
-        found.model = without
-        found.near.pop(_DAILY, None)
-        found.evidence.pop(_DAILY, None)
-        found.reasons[_DAILY] = f'the {likelier} explains the power better'
+def _withdraw_imitations(found: SearchResult) -> None:
+    """Remove causes in time if what the load does to the unit over hours explains more."""
+    for a in found.model.active:
+        if not a.cause.slow:
+            continue
+        without, _ = improve(found.task, found.model.without(a.name), 3)
+        effect = answer(found.task.grids, found.model) - answer(found.task.grids, without)
+        if likelier := likelier_over_hours(found.task, without, effect, a.size):
+            found.model = without
+            found.near.pop(a.name, None)
+            found.evidence.pop(a.name, None)
+            found.reasons[a.name] = f'the {likelier} explains the power better'
 
 
 def _withdraw_small(found: SearchResult) -> None:

@@ -18,7 +18,7 @@ from scipy.ndimage import median_filter
 
 from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
-from valveflow_ros.diagnosis.grids import DAY_S, FOLDS, SEALED_FOLD
+from valveflow_ros.diagnosis.grids import FOLDS, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.slow import Levels, Regression, half_hours, regressions
 from valveflow_ros.fit.whitening import inflation
@@ -205,25 +205,34 @@ def _over_hours(task: Task, model: Extended, values: dict[str, FloatArray]) -> S
     return Structure((list(columns)[k],), gain, float('inf'), explained)
 
 
-def likelier_than_time_of_day(task: Task, model: Extended) -> str:
-    """Return what changes over hours and explains the power better than the time of day; or ''.
+def likelier_over_hours(task: Task, model: Extended, effect: FloatArray, size: int) -> str:
+    """Return what changes over hours and explains the power better than a cause in time; or ''.
 
     A unit that runs by a daily programme repeats each day all that its load does to it. The
-    comparison is that of `structure` over hours; ``model`` has no daily cycle.
+    comparison is that of `structure` over hours.
+
+    Parameters
+    ----------
+    task : Task
+    model : Extended
+        The model without the cause, fitted again.
+    effect : float64 (m,)
+        What the cause adds to the power of this model, MW.
+    size : int
+        Number of its parameters.
     """
     values = variables(task, model)
-    angle = 2.0 * np.pi * task.grids.means(task.grids.time_s) / DAY_S
-    day = {'time of day': [np.cos(angle), np.sin(angle)]}
-    columns = day | _slow_columns(task, {name: values[name] for name in _SLOW})
+    columns = {'': [effect]} | _slow_columns(task, {name: values[name] for name in _SLOW})
     found, places, fits = _regressed(task, model, columns)
     if not fits:
         return ''
+    numbers = (size, *map(len, places[1:]))
     scores = [
-        fit.likelihood - 0.5 * len(place) * float(np.log(len(found.power)))
-        for fit, place in zip(fits[1:], places, strict=True)
+        fit.likelihood - fits[0].likelihood - 0.5 * number * float(np.log(len(found.power)))
+        for fit, number in zip(fits[1:], numbers, strict=True)
     ]
     best = int(np.argmax(scores))
-    return list(columns)[best] if best and scores[best] > 0.0 else ''
+    return list(columns)[best] if scores[best] > 0.0 else ''
 
 
 def _slow_columns(task: Task, values: dict[str, FloatArray]) -> dict[str, list[FloatArray]]:
