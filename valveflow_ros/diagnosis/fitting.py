@@ -16,7 +16,12 @@ from valveflow_ros.diagnosis.cause import Cause, FittedCause, Kind, Stage, Value
 from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
 from valveflow_ros.diagnosis.grids import ORDER, Grids
 from valveflow_ros.fit.descent import descend, gauss_newton
-from valveflow_ros.fit.problem import free_parameters, with_level_moved, within_bounds
+from valveflow_ros.fit.problem import (
+    free_parameters,
+    with_level_moved,
+    within_bounds,
+    within_reach,
+)
 from valveflow_ros.fit.whitening import fit_ar
 from valveflow_ros.numerics import cores, jit, run_in_threads
 from valveflow_ros.records import BoolArray, FloatArray
@@ -379,7 +384,10 @@ def improve(
         causes = task.innovations(cause_tangents(task, model))
         rest, across = task.innovations(task.residual(model)), base.T @ causes
         normal = np.block([[sums, across], [across.T, causes.T @ causes]])
-        return normal, np.append(base.T @ rest, causes.T @ rest)
+        slope = np.append(base.T @ rest, causes.T @ rest)
+        return within_reach(
+            model.base, base_mask(task, model), normal, slope, task.grids.step_s
+        )  # fmt: skip
 
     return gauss_newton(
         model, task.cost, equations, lambda m, step: _stepped(task, m, step), steps,

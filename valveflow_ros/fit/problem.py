@@ -32,6 +32,7 @@ _FEW = 4
 _HELD_SHARE = 0.3
 # A shorter lag, as a fraction of the time between rows, does not show in them.
 LEAST_LAG, _LONGEST_LAG_S, _LONGEST_DELAY_S = 0.1, 3600.0, 600.0
+_TINY = 1e-7  # relative to 1 plus the size of a parameter
 CLOSEST_KNOTS = 0.004  # of their range
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
@@ -311,6 +312,25 @@ def within_bounds(model: RegionalModel, packed: FloatArray, step_s: float) -> Re
     return replace(found, knots=np.minimum(spread, knots[-1] - room[-1]) + room)
 
 
+def within_reach(
+    model: RegionalModel, free: BoolArray, normal: FloatArray, slope: FloatArray, step_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return normal equations that hold the parameters at a bound that the slope points out of.
+
+    A step that wants to move them is wrong for the others too (Bertsekas, SIAM J. Control Optim.
+    20, 1982). The free parameters of the model come first in the equations.
+    """
+    packed = model.pack()
+    at = slope[: int(free.sum())]
+    wanted = np.zeros(len(packed))
+    wanted[free] = _TINY * (1.0 + np.abs(packed[free])) * np.sign(at)
+    moved = within_bounds(model, packed + wanted, step_s).pack() - packed
+    held = np.flatnonzero(np.abs(moved - wanted)[free] > 0.5 * np.abs(wanted[free]))
+    normal, slope = normal.copy(), slope.copy()
+    normal[held], normal[:, held], slope[held] = 0.0, 0.0, 0.0
+    return normal, slope
+
+
 def move(
     problem: Problem, model: RegionalModel, ar: FloatArray, free: BoolArray, steps: int
 ) -> tuple[RegionalModel, float]:
@@ -318,7 +338,10 @@ def move(
 
     def equations(model: RegionalModel) -> tuple[FloatArray, FloatArray]:
         sums, _ = problem.normal(model, ar)
-        return sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free]
+        return within_reach(
+            model, free, sums[:-1, :-1][np.ix_(free, free)], sums[:-1, -1][free],
+            problem.samples.step_s,
+        )  # fmt: skip
 
     def shifted(model: RegionalModel, step: FloatArray) -> RegionalModel:
         packed = model.pack()
