@@ -6,14 +6,12 @@ import io
 import json
 import unicodedata
 import zoneinfo
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli import command
-from valveflow_ros.cli.command import _PARTS, Console, VerbResult, columns, share_of_time
+from valveflow_ros.cli.command import Console, VerbResult, columns
 
 
 class Terminal(io.StringIO):
@@ -134,27 +132,3 @@ def test_columns_line_up(rows):
     for line, row in zip(lines[1:], rows, strict=True):
         assert line.ljust(width).endswith(row[2].rjust(5)) or row[2] != row[2].rstrip()
         assert line.startswith(row[0].rstrip())
-
-
-def test_the_share_of_the_time_goes_forward_from_nothing_to_all():
-    for verb, parts in _PARTS.items():
-        shares = []
-        for name, told_from, told_to, _ in parts:
-            shares += [share_of_time(verb, told, name) for told in (told_from, told_to)]
-        assert shares[0] == 0.0, verb
-        assert shares == sorted(shares), verb
-        assert all(0.0 <= share <= 1.0 for share in shares), verb
-        # What is not in the table stays as it is told.
-        assert share_of_time(verb, 0.3, 'something else') == 0.3
-    assert share_of_time('no verb', 0.3, '') == 0.3
-
-
-def test_every_part_of_the_time_is_told_somewhere():
-    """Also those of the verbs that take too long to be run here."""
-    root = Path(command.__file__).parents[1]
-    rooms = ('cli/verbs', 'interface', 'fit', 'monitoring', 'segments', 'baselines', 'diagnosis')
-    text = ''.join(p.read_text() for room in rooms for p in root.glob(f'{room}/*.py'))
-    for parts in _PARTS.values():
-        for name, *_ in parts:
-            # A sentence with a number in it is told from its beginning on.
-            assert f"'{name}" in text or f"'{name.rsplit(' ', 1)[0]}" in text, name

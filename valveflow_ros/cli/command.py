@@ -30,74 +30,6 @@ _TERMINAL = 80  # characters; a wider table has its head in several lines
 # Terminal control characters and those that change the text direction, except tabs and newlines.
 _COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
 
-# Relative durations of the parts of a verb's work, so that the bar moves evenly: name of the part,
-# the fractions that the verb reports at its begin and end, and the fraction of the time at its
-# begin. Measured with ``benchmarks/pace.py`` on logs of one and three days; only the proportions
-# matter.
-_PARTS: Mapping[str, Sequence[tuple[str, float, float, float]]] = {
-    'identify': (
-        ('starting', 0.0, 0.0, 0.0),
-        ('reading', 0.02, 0.02, 0.13),
-        ('finding segments', 0.1, 0.5, 0.21),
-        ('exact partition', 0.6, 0.6, 0.39),
-        ('curve and dynamics together', 0.6, 0.6, 0.57),
-        ('writing the report', 0.9, 0.9, 0.93),
-    ),
-    'diagnose': (
-        ('starting', 0.0, 0.0, 0.0),
-        ('reading', 0.02, 0.02, 0.06),
-        ('finding segments', 0.1, 0.5, 0.09),
-        ('exact partition', 0.6, 0.6, 0.16),
-        ('curve and dynamics together', 0.6, 0.6, 0.25),
-        ('the record itself', 0.41, 0.41, 0.33),
-        ('simulation fitted', 0.425, 0.425, 0.34),
-        ('causes tried', 0.475, 0.475, 0.4),
-        ('further causes tried', 0.475, 0.75, 0.4),
-        ('the sealed blocks', 0.75, 0.75, 0.74),
-        ('what is left', 0.8, 0.8, 0.75),
-        ('how sure it is', 0.85, 0.85, 0.79),
-        ('writing the report', 0.95, 0.95, 0.98),
-    ),
-    'validate': (
-        ('starting', 0.0, 0.0, 0.0),
-        ('reading', 0.02, 0.02, 0.3),
-        ('finding segments', 0.1, 0.5, 0.38),
-        ('judging', 0.7, 0.7, 0.65),
-        ('writing the report', 0.9, 0.9, 0.92),
-    ),
-    'compare': (
-        ('starting', 0.0, 0.0, 0.0),
-        ('reading', 0.02, 0.02, 0.14),
-        ('finding segments', 0.04, 0.4, 0.18),
-        ('curve of special segments', 0.4, 0.4, 0.27),
-        ('exact partition', 0.4, 0.4, 0.28),
-        ('curve and dynamics together', 0.4, 0.4, 0.3),
-        ('Hammerstein model: starts', 0.5, 0.5, 0.42),
-        ('Hammerstein model: orders', 0.5, 0.5, 0.5),
-        ('Hammerstein model: all data', 0.5, 0.5, 0.66),
-        ('sparse model: derivative', 0.75, 0.75, 0.79),
-        ('sparse model: weak', 0.75, 0.75, 0.84),
-        ('sparse model: all data', 0.75, 0.75, 0.92),
-        ('judging', 0.85, 0.85, 0.94),
-        ('writing the report', 0.95, 0.95, 0.95),
-    ),
-}
-
-
-def share_of_time(verb: str, told: float, what: str) -> float:
-    """Return the fraction of a verb's time that has passed at fraction ``told`` of step ``what``.
-
-    A step that is not in the table is returned unchanged.
-    """
-    rows = _PARTS.get(verb, ())
-    for k, (name, told_from, told_to, begins) in enumerate(rows):
-        if what.startswith(name):
-            ends = rows[k + 1][3] if k + 1 < len(rows) else 1.0
-            width = told_to - told_from
-            inside = min(max((told - told_from) / width, 0.0), 1.0) if width else 0.0
-            return begins + (ends - begins) * inside
-    return told
-
 
 @dataclass(frozen=True, slots=True)
 class VerbResult:
@@ -116,16 +48,15 @@ class Console(Progress):
     """Messages, warnings, a progress bar on a terminal, and the result, perhaps as JSON."""
 
     def __init__(
-        self, out: TextIO, err: TextIO, *, as_json: bool = False, quiet: bool = False,
-        verb: str = '',
-    ) -> None:  # fmt: skip
+        self, out: TextIO, err: TextIO, *, as_json: bool = False, quiet: bool = False
+    ) -> None:
         self._out = out
         self._as_json = as_json
         self._quiet = quiet
         self._unit = 'MW'
         self._zone: tzinfo | None = None
         bar = err.isatty() and os.environ.get('TERM') != 'dumb'
-        self._line = ProgressLine(err, bar, lambda told, what: share_of_time(verb, told, what))
+        self._line = ProgressLine(err, bar)
 
     def __call__(self, share: float, what: str) -> None:
         """Show the progress: a bar on a terminal, otherwise a line if the work takes long."""

@@ -231,10 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for variable in _BLAS_THREADS:  # NumPy is not yet loaded
         os.environ.setdefault(variable, '1')
     words = list(sys.argv[1:] if arguments is None else arguments)
-    console = Console(
-        sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words,
-        verb=words[0] if words else '',
-    )  # fmt: skip
+    console = Console(sys.stdout, sys.stderr, as_json='--json' in words, quiet='--quiet' in words)
     # Compilation creates millions of permanent objects: garbage collection with the usual
     # frequency takes a tenth of the time of the first run.
     gc.set_threshold(50_000, 20, 50)

@@ -21,19 +21,12 @@ _FIRST_LINE_S, _LONGER, _LONGEST_PAUSE_S = 15.0, 2.0, 120.0
 
 
 class Progress:
-    """Keeps a bar, or a few lines, up to date; updates the time also between two calls.
-
-    ``share_of_time`` converts the reported fraction of the work and its description to a fraction
-    of the time.
-    """
+    """Keeps a bar, or a few lines, up to date; updates the time also between two calls."""
 
     def __init__(
-        self, err: TextIO, bar: bool,
-        share_of_time: Callable[[float, str], float] = lambda share, _what: share,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self, err: TextIO, bar: bool, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._err, self._bar, self._clock = err, bar, clock
-        self._share_of_time = share_of_time
         wide = (getattr(err, 'encoding', None) or 'utf-8').lower().startswith('utf')
         self._blocks = '█░' if wide else '#.'
         self._lock = threading.RLock()
@@ -59,7 +52,7 @@ class Progress:
                 self._start()
             new = what != self._what
             # Progress never decreases.
-            self._share = max(self._share, min(max(self._share_of_time(share, what), 0.0), 1.0))
+            self._share = max(self._share, min(max(share, 0.0), 1.0))
             self._what = what
             gone = now - self._begun_s
             if gone >= _LEAST_S and self._share >= _LEAST_SHARE:
