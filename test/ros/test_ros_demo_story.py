@@ -4,7 +4,7 @@
 
 from valveflow_msgs.msg import Alarm, Diagnosis, DiagnosisCause, FlowCharacteristic
 
-from valveflow_ros.ros.demo import Story, minute, told_in_the_end
+from valveflow_ros.ros.demo import Story, told_in_the_end
 from valveflow_ros.ros.encoding import header, to_time
 
 HOUR = 3600 * 10**9
@@ -41,13 +41,15 @@ def lines(capsys):
 
 def test_one_fault_is_one_story(capsys):
     story = Story(FAULT)
+    story.on_curve(FlowCharacteristic(status=FlowCharacteristic.UNKNOWN, cause='No rows.'))
+    story.on_alarm(alarm(T0, 0, Alarm.NORMAL))
+    assert story.outcome() == 'The fault raised no alarm.'
     for k in range(1, 9):
         story.on_curve(curve(T0 + 4 * k * HOUR, [u + k for u in KNEES]))
+    story.on_alarm(alarm(FAULT - HOUR, 1))
     story.reached(FAULT - 1)
-    told = lines(capsys)
-    assert told == ['2023-11-15 04:00  first curve: 4 pieces, breakpoints at u = 1251, 1601, 1901']
-    for k in range(5):
-        at = FAULT + (1 + 6 * k) * HOUR
+    for k in range(1, 5):
+        at = FAULT + 6 * k * HOUR
         story.on_alarm(alarm(at, k + 1))
         story.on_alarm(alarm(at + HOUR // 6, k + 1, Alarm.ACKNOWLEDGED))
         # Out of the curve's range, and back in it: the same alarm.
@@ -55,48 +57,26 @@ def test_one_fault_is_one_story(capsys):
         story.on_alarm(alarm(at + 2 * HOUR, k + 1, Alarm.NORMAL))
         story.on_curve(curve(at + 3 * HOUR, KNEES[:2]))
     told = lines(capsys)
-    assert 'the fault begins; 8 curves so far, the last with 4 pieces' in told[0]
-    assert 'ALARM residual: The unit gives 4.4 MW less.' in told[1]
-    assert [line[18:] for line in told[2:]] == [
-        'acknowledged, by the service acknowledge_alarms',
-        'the unit follows the curve again; the alarm is cleared',
-        *['ALARM residual: The unit gives 4.4 MW less.'] * 4,
+    said = 'ALARM residual: The unit gives 4.4 MW less.'
+    assert (
+        told[0] == '2023-11-15 04:00  first curve: 4 pieces, breakpoints at u = 1251, 1601, 1901'
+    )
+    assert [line[18:] for line in told[1:]] == [
+        said, '--- the fault begins; 8 curves so far ---', *[said] * 4,
     ]  # fmt: skip
-    assert told == sorted(told)
-    assert 'the first alarm came 1.0 h later; alarms in all: 5' in story.outcome()
+    assert 'the first alarm came 6.0 h later; alarms in all: 4' in story.outcome()
 
 
-def test_a_diagnosis_is_told_in_full_once(capsys):
+def test_each_diagnosis_is_told(capsys):
     story = Story(FAULT)
     story.on_diagnosis(Diagnosis())
     story.on_diagnosis(diagnosis(FAULT - HOUR))
-    story.on_diagnosis(diagnosis(FAULT + 3 * HOUR, sentence='The model explains the unit.'))
-    for hours in (9, 20):
-        story.on_diagnosis(diagnosis(FAULT + hours * HOUR, 'curve_step', sentence='It bends.'))
+    story.on_diagnosis(diagnosis(FAULT + 9 * HOUR, 'curve_step', sentence='It bends.'))
     assert [line[18:] for line in lines(capsys)] == [
         'diagnosis of the data so far: nothing found',
-        '--- the fault begins; no curve so far ---',
-        'diagnosis of the data so far: nothing found; 3 h of them are with the fault',
+        '--- the fault begins; 0 curves so far ---',
         'diagnosis of the data so far: named curve_step. It bends.',
-        'diagnosis of the data so far: named curve_step, as before',
     ]
-
-
-def test_the_times_of_the_lines_never_go_back_and_an_alarm_before_the_fault_is_not_its_own(capsys):
-    story = Story(FAULT)
-    for _ in range(2):
-        story.on_curve(FlowCharacteristic(status=FlowCharacteristic.UNKNOWN, cause='No rows.'))
-    story.on_alarm(alarm(T0, 0, Alarm.NORMAL))
-    (line,) = lines(capsys)
-    assert line.endswith('No rows.')
-    story.on_alarm(alarm(FAULT - HOUR, 1))
-    assert story.outcome() == 'The fault raised no alarm.'
-    story.on_alarm(alarm(FAULT + 5 * HOUR, 2))
-    story.on_diagnosis(diagnosis(FAULT + 3 * HOUR))
-    _, begins, raised, late = lines(capsys)
-    assert begins[:16] == '2023-11-16 12:00' < raised[:16] == late[:16]
-    assert late.endswith(f'(at {minute(FAULT + 3 * HOUR)})')
-    assert story.outcome().endswith('the first alarm came 5.0 h later.')
 
 
 def test_the_last_line_tells_what_is_missing():

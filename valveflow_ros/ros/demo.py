@@ -43,11 +43,6 @@ _BEFORE_ACKNOWLEDGING_S = 0.2
 _PATIENCE_S = 10.0
 _QUIET_LOOKS = 3
 _LONGEST_WAIT_S = 120.0
-_STATES = {
-    Alarm.NORMAL: 'the unit follows the curve again; the alarm is cleared',
-    Alarm.ACKNOWLEDGED: 'acknowledged, by the service acknowledge_alarms',
-    Alarm.RETURNED_UNACKNOWLEDGED: 'the alarm has gone by itself',
-}
 _VERDICTS = {
     Diagnosis.NOTHING: 'nothing found',
     Diagnosis.UNEXPLAINED: 'something that it cannot name',
@@ -140,67 +135,42 @@ class Process:
 
 
 class Story:
-    """Prints the important messages of the monitor.
+    """Prints the first curve, each alarm and each diagnosis of the monitor.
 
-    A fault of one valve has an effect only while this valve is in use, so its alarm comes and
-    goes with the load, and the monitor fits a new curve every few hours. The first alarm and
-    curve are described in full, the others briefly or only if something has changed.
     ``fault_ns`` is the time at which the hidden fault begins.
     """
 
     def __init__(self, fault_ns: int) -> None:
-        self._fault_ns = fault_ns
-        self._fault_told = False
-        self._last_curve = self._cause = ''
-        self._last_told_ns = 0
+        self._fault_ns, self._fault_told = fault_ns, False
         self._occurrences: dict[str, int] = {}
-        self._raised_ns: list[int] = []
-        self._named: list[str] = []
+        self.alarms_of_fault: list[int] = []  # times of the alarms since then, in ns
         self.curves: list[FlowCharacteristic] = []
         self.diagnoses: list[Diagnosis] = []
 
-    @property
-    def alarms_of_fault(self) -> list[int]:
-        """Return the times of all alarms after the start of the fault, in ns."""
-        return [time_ns for time_ns in self._raised_ns if time_ns >= self._fault_ns]
-
     def on_curve(self, message: FlowCharacteristic) -> None:
-        """Print the first curve, or a curve with another number of pieces."""
+        """Keep a new curve; print the first one."""
         time_ns = from_time(message.window_end)
-        if message.status != FlowCharacteristic.FRESH:
-            if message.cause not in ('', self._cause) and not self.curves:
-                self._cause = message.cause
-                self._tell(time_ns or DEFAULT_START_NS, message.cause)
-            return
-        if self.curves and self.curves[-1].model_id == message.model_id:
+        known = self.curves and self.curves[-1].model_id == message.model_id
+        if message.status != FlowCharacteristic.FRESH or known:
             return
         self.reached(time_ns)
-        knees = ', '.join(f'{u:.0f}' for u in message.breakpoints[1:-1])
-        before = self._last_curve.partition(',')[0]
-        pieces = counted(message.pieces, 'piece')
-        self._last_curve = (
-            f'{pieces}, {f"breakpoints at u = {knees}" if knees else "no breakpoint"}'
-        )
         self.curves.append(message)
         if len(self.curves) == 1:
-            self._tell(time_ns, f'first curve: {self._last_curve}')
-        elif not self._fault_told and before != pieces:
-            self._tell(time_ns, f'new curve: {self._last_curve}')
+            knees = ', '.join(f'{u:.0f}' for u in message.breakpoints[1:-1])
+            pieces = counted(message.pieces, 'piece')
+            _tell_at(time_ns, f'first curve: {pieces}, breakpoints at u = {knees or "none"}')
 
     def on_alarm(self, message: Alarm) -> None:
-        """Print a new alarm, and the state changes of the first one."""
-        time_ns, state = from_time(message.header.stamp), message.state
-        goes_on = len(self._raised_ns) == 1 and message.previous_state != Alarm.SUPPRESSED
-        if state == Alarm.UNACKNOWLEDGED:
-            self.reached(time_ns)
-            # An alarm that was suppressed and is active again is not a new one.
-            if message.occurrence == self._occurrences.get(message.name):
-                return
-            self._occurrences[message.name] = message.occurrence
-            self._raised_ns.append(time_ns)
-            self._tell(time_ns, f'ALARM {message.name}: {message.sentence}')
-        elif goes_on and state in _STATES:
-            self._tell(time_ns, _STATES[state])
+        """Print a new alarm; one that was suppressed and is active again is not new."""
+        time_ns = from_time(message.header.stamp)
+        again = message.occurrence == self._occurrences.get(message.name)
+        if message.state != Alarm.UNACKNOWLEDGED or again:
+            return
+        self.reached(time_ns)
+        self._occurrences[message.name] = message.occurrence
+        if time_ns >= self._fault_ns:
+            self.alarms_of_fault.append(time_ns)
+        _tell_at(time_ns, f'ALARM {message.name}: {message.sentence}')
 
     def on_diagnosis(self, message: Diagnosis) -> None:
         """Print a diagnosis."""
@@ -210,14 +180,10 @@ class Story:
         until_ns = from_time(message.header.stamp)
         self.reached(until_ns)
         told = _VERDICTS.get(message.verdict, 'unknown')
-        names = [cause.name for cause in message.causes]
-        if names:
-            more = ', as before' if names == self._named else f'. {message.sentence}'
-            told, self._named = f'named {", ".join(names)}{more}', names
-        elif self._fault_told:
-            hours = (until_ns - self._fault_ns) / _HOUR_NS
-            told += f'; {hours:.0f} h of them are with the fault'
-        self._tell(until_ns, f'diagnosis of the data so far: {told}')
+        if message.causes:
+            names = ', '.join(cause.name for cause in message.causes)
+            told = f'named {names}. {message.sentence}'
+        _tell_at(until_ns, f'diagnosis of the data so far: {told}')
 
     def outcome(self) -> str:
         """Return a sentence about the alarms on the fault."""
@@ -231,21 +197,14 @@ class Story:
 
     def reached(self, time_ns: int) -> None:
         """Print that the fault begins, once the plant has reached that time."""
-        if self._fault_told or time_ns < self._fault_ns:
-            return
-        self._fault_told = True
-        known = 'no curve so far'
-        if self.curves:
+        if not self._fault_told and time_ns >= self._fault_ns:
+            self._fault_told = True
             curves = counted(len(self.curves), 'curve')
-            known = f'{curves} so far, the last with {self._last_curve}'
-        self._tell(self._fault_ns, f'--- the fault begins; {known} ---')
+            _tell_at(self._fault_ns, f'--- the fault begins; {curves} so far ---')
 
-    def _tell(self, time_ns: int, words: str) -> None:
-        """Print one line; the times of the lines never decrease."""
-        if time_ns < self._last_told_ns:
-            words += f' (at {minute(time_ns)})'
-        self._last_told_ns = max(time_ns, self._last_told_ns)
-        tell(f'{minute(self._last_told_ns)}  {words}')
+
+def _tell_at(time_ns: int, words: str) -> None:
+    tell(f'{minute(time_ns)}  {words}')
 
 
 class Watch(Node):
