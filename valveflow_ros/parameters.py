@@ -420,15 +420,13 @@ _TOPICS = ('plant_sample', *(info.topic for info in SIGNALS))
 class Settings(Mapping[str, Value]):
     """A complete, checked set of parameter values; immutable.
 
+    Raises `ParameterError` if a name is unknown, a value is invalid, or two values contradict each
+    other.
+
     Parameters
     ----------
     values : mapping, optional
         Values that differ from the defaults.
-
-    Raises
-    ------
-    ParameterError
-        A name is unknown, a value is invalid, or two values contradict each other.
     """
 
     __slots__ = ('_values',)
@@ -475,10 +473,7 @@ class Settings(Mapping[str, Value]):
     def live_changes(self, wanted: Settings) -> dict[str, Value]:
         """Return the values that differ in ``wanted``.
 
-        Raises
-        ------
-        ParameterError
-            A value differs that may not be changed while the monitor runs.
+        Raises `ParameterError` if a value differs that may not be changed while the monitor runs.
         """
         changed = wanted.changes(self)
         for name in changed:
@@ -490,10 +485,7 @@ class Settings(Mapping[str, Value]):
     def earlier(cls, values: Mapping[str, object]) -> Settings:
         """Return the settings of an earlier version without parameters that are invalid now.
 
-        Raises
-        ------
-        ParameterError
-            Two values contradict each other.
+        Raises `ParameterError` if two values contradict each other.
         """
         known: dict[str, object] = {}
         for name, value in values.items():
@@ -550,11 +542,8 @@ def covariate_columns(
 ) -> dict[str, str]:
     """Return ``COLUMN`` or ``COLUMN:UNIT`` of texts ``NAME=COLUMN[:UNIT]``, by name.
 
-    Raises
-    ------
-    UsageError
-        A text has another form, or a name is given twice. The message begins with ``where`` and
-        calls the column ``column``.
+    Raises `UsageError` if a text has another form, or a name is given twice. The message begins
+    with ``where`` and calls the column ``column``.
     """
     found: dict[str, str] = {}
     for text in said:

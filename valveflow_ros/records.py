@@ -274,10 +274,7 @@ _OFFSET = re.compile(r'(?:UTC|GMT)?\s*([+-])(\d{1,2})(?::?(\d{2}))?')
 def zone_of(name: str) -> tzinfo | None:
     """Return a time zone by its name or offset; ``None`` for UTC.
 
-    Raises
-    ------
-    InputError
-        There is no such zone.
+    Raises `InputError` if there is no such zone.
     """
     text = name.strip()
     if text.upper() in ('', 'UTC', 'Z', 'GMT'):

@@ -41,10 +41,7 @@ class Memory:
     def restore(self, saved: State) -> None:
         """Continue from a saved state.
 
-        Raises
-        ------
-        DataError
-            The state does not fit; the object must not be used then.
+        Raises `DataError` if the state does not fit; the object must not be used then.
         """
         own = {name.lstrip('_'): getattr(self, name) for name in self.REMEMBERED}
         put_back(
@@ -118,10 +115,7 @@ def copies(arrays: Mapping[str, NDArray[Any]]) -> State:
 def put_back(arrays: Mapping[str, NDArray[Any]], saved: State) -> None:
     """Overwrite arrays with the saved ones of the same names.
 
-    Raises
-    ------
-    DataError
-        An array is missing, or has another type or shape.
+    Raises `DataError` if an array is missing, or has another type or shape.
     """
     for name, array in arrays.items():
         given = saved.get(name)
@@ -166,10 +160,7 @@ def to_bytes(state: State) -> bytes:
 def from_bytes(data: bytes) -> State:
     """Return the state in bytes from `to_bytes`.
 
-    Raises
-    ------
-    DataError
-        The bytes are incomplete, changed, of another version, or no state.
+    Raises `DataError` if the bytes are incomplete, changed, of another version, or no state.
     """
     line, _, content = data.partition(b'\n')
     words = line.split(b' ')

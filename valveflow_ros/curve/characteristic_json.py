@@ -56,10 +56,7 @@ HELD = Maybe(ListOf({'name': Text(), 'values': Members(Number(-1e12, 1e12)), 'se
 def held_from(raw: object) -> tuple[HeldCause, ...]:
     """Read the causes that `held_json` wrote from an object, which may have none.
 
-    Raises
-    ------
-    DataError
-        The content is invalid; the message names the place.
+    Raises `DataError` if the content is invalid; the message names the place.
     """
     return _held(checked(raw, {'held': HELD}, _WHOLE)['held'])
 
@@ -252,13 +249,9 @@ _SCHEMA = {
 def from_json(raw: object) -> Characteristic:
     """Read the content of ``characteristic.json``.
 
-    The keys of the specified format are required; keys that this program adds may
-    be missing, as in a file of another program.
-
-    Raises
-    ------
-    DataError
-        It is invalid, or of an unsupported version; the message names the place.
+    The keys of the specified format are required; keys that this program adds may be missing, as
+    in a file of another program. Raises `DataError` if it is invalid, or of an unsupported
+    version; the message names the place.
     """
     if not isinstance(raw, dict) or raw.get('format') != FORMAT:
         raise DataError(f"This is no flow characteristic: 'format' must be '{FORMAT}'.")
@@ -317,10 +310,7 @@ def from_json(raw: object) -> Characteristic:
 def form_of(top: dict[str, Any], whole: str, inside: str = '') -> StaticForm:
     """Return the form that a model's keys specify, and refuse keys that do not suit the axis.
 
-    Raises
-    ------
-    DataError
-        The message names the key, which is ``inside`` another one.
+    Raises `DataError`; the message names the key, which is ``inside`` another one.
     """
     axis = top['axis'] or INTEGRATED_INPUT
     scale, offset = top['pressure_scale_exponent'] or 0.0, top['offset_mw'] or 0.0
@@ -388,10 +378,7 @@ class Joint(enum.Enum):
 def check_pieces(pieces: list[dict[str, Any]], whole: str, path: str, joint: Joint) -> None:
     """Refuse lines that are not in sequence, or have values that no plant has.
 
-    Raises
-    ------
-    DataError
-        The message names the place.
+    Raises `DataError`; the message names the place.
     """
     for k, piece in enumerate(pieces):
         begin, before = piece['u_from'], pieces[k - 1] if k else None

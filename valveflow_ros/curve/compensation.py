@@ -122,6 +122,9 @@ def compensate(
 ) -> Compensation:  # fmt: skip
     """Invert a curve.
 
+    Raises `DataError` if the curve does not always rise; the message names the piece and gives
+    advice. Raises `InputError` if ``points`` or the range is invalid for a table.
+
     Parameters
     ----------
     points : int

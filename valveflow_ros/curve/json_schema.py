@@ -79,6 +79,8 @@ MOST_PIECES = 100
 def checked(value: Any, schema: Any, whole: str, path: str = '') -> Any:
     """Return the JSON value validated by the schema; keys that the schema lacks are left out.
 
+    Raises `DataError` if a value is missing or invalid; the message names the place.
+
     Parameters
     ----------
     value : object
@@ -86,11 +88,6 @@ def checked(value: Any, schema: Any, whole: str, path: str = '') -> Any:
     schema : object
     whole, path : str
         The name of the file in messages, and the place in it.
-
-    Raises
-    ------
-    DataError
-        A value is missing or invalid; the message names the place.
     """
     place = whole, path
     if isinstance(schema, dict):

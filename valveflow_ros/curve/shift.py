@@ -204,6 +204,9 @@ def judge_shift(
 ) -> Shift:
     """Test the current curve for a shift from a reference.
 
+    Raises `DataError` if both curves have different axes, or V p^m with different m, or no u in
+    common.
+
     Parameters
     ----------
     reference, current : Characteristic
@@ -220,11 +223,6 @@ def judge_shift(
     Shift
         A piece has shifted if the curves differ in its middle and its segments confirm this,
         or if its segments change at some time and differ from the reference after it.
-
-    Raises
-    ------
-    DataError
-        Both curves have different axes, or V p^m with different m, or no u in common.
     """
     limits = limits or ShiftLimits()
     _comparable(reference, current)

@@ -99,10 +99,7 @@ class _Begun:
 def fit(task: FitTask, progress: Progress = lambda _: None) -> Characteristic:
     """Fit the characteristic.
 
-    Raises
-    ------
-    DataError
-        The data determine no curve; the message says why and what would help.
+    Raises `DataError` if the data determine no curve; the message says why and what would help.
     """
     begun = _begin(task, progress)
     if task.settings.flag('refine'):
@@ -132,13 +129,9 @@ def outline(
 ) -> tuple[RegionalModel, StaticForm]:
     """Find curve and dynamics without the last fit on single rows and without errors.
 
-    This is a start for a caller with a fit of its own, in two thirds of the time of `fit`.
-    The form is that of the task, or the one that the data require.
-
-    Raises
-    ------
-    DataError
-        The data determine no curve or no dynamics; the message says why.
+    This is a start for a caller with a fit of its own, in two thirds of the time of `fit`. The
+    form is that of the task, or the one that the data require. Raises `DataError` if the data
+    determine no curve or no dynamics; the message says why.
     """
     begun = _begin(task, progress)
     progress('curve and dynamics together')

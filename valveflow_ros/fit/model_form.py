@@ -122,6 +122,8 @@ def find_form(
 ) -> FoundForm | None:
     """Return the form that the data require; None if they are too few to compare forms.
 
+    Raises `DataError` if the means are too few to find the exponent or c of the fixed form.
+
     Parameters
     ----------
     opening, pressure, power : float64 (n,)
@@ -138,11 +140,6 @@ def find_form(
         Use this form, and compare it with the other one.
     known : StaticForm, optional
         The form from earlier data of the same valve; it is kept unless the data show another.
-
-    Raises
-    ------
-    DataError
-        The means are too few to find the exponent or c of the fixed form.
     """
     means = _means_of(opening, pressure, power, spans, period_s)
     if axis == INTEGRATED_INPUT and held is None:

@@ -324,6 +324,8 @@ def refine(
 ) -> Refined:  # fmt: skip
     """Fit curve and dynamics together, from ``start``'s curve.
 
+    Raises `TooFewSamplesError` if too few rows are far enough after a gap.
+
     Parameters
     ----------
     samples : Samples
@@ -339,11 +341,6 @@ def refine(
         Start of the exponent of the pressure if it is free.
     usual : float, optional
         An exponent that is taken unless another one is clearly better.
-
-    Raises
-    ------
-    TooFewSamplesError
-        Too few rows are far enough after a gap.
 
     Returns
     -------
@@ -457,12 +454,8 @@ def search(
 ) -> tuple[RegionalModel, float]:
     """Find regions and pieces on averaged rows: `refine` without its last fit.
 
-    Return the model, and the change of the exponent of the pressure.
-
-    Raises
-    ------
-    TooFewSamplesError
-        As in `refine`.
+    Return the model, and the change of the exponent of the pressure. Raises `TooFewSamplesError`
+    if As in `refine`.
     """
     model, _, moved, _ = _outlined(samples, start, most_pieces, exponent, usual)
     return model, moved

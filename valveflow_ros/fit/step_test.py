@@ -257,11 +257,8 @@ class StepTest:
 def identify_step_test(table: SampleTable, settings: Settings) -> StepTest:
     """Identify the curve of a step test.
 
-    Raises
-    ------
-    DataError
-        Too few levels, the pressure was not constant, or the power does not rise with the
-        opening; the message says what was found.
+    Raises `DataError` if there are too few levels, the pressure was not constant, or the power
+    does not rise with the opening; the message says what was found.
     """
     opening = np.ascontiguousarray(table.column(Signal.VALVE_OPENING))
     pressure = table.column(Signal.MAIN_STEAM_PRESSURE)

@@ -39,10 +39,7 @@ def fit_ar(residual: FloatArray, weight: ByteArray, order: int = ORDER) -> Float
 def yule_walker(products: FloatArray) -> FloatArray:
     """Return the AR coefficients (k,) of a process with these mean products at lags 0 to k.
 
-    Raises
-    ------
-    LinAlgError
-        There is no solution, or a product is not finite.
+    Raises `LinAlgError` if there is no solution, or a product is not finite.
     """
     if not np.isfinite(products).all():
         raise np.linalg.LinAlgError('the residual is not finite')

@@ -100,20 +100,14 @@ class LogContents:
     def iter_messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
         """Yield raw messages in the order of their log times, reading the file again.
 
-        A latched message that a recorder repeated at the start of a later split
-        is yielded once.
+        A latched message that a recorder repeated at the start of a later split is yielded once.
+        Raises `InputError` if a topic is not in the log. Raises `RecordingError` if the file can
+        no longer be read.
 
         Parameters
         ----------
         topics : collection of str, optional
             Full names; all topics by default.
-
-        Raises
-        ------
-        InputError
-            If a topic is not in the log.
-        RecordingError
-            If the file can no longer be read.
         """
         for topic in topics or ():
             self._topic(topic)
@@ -122,12 +116,8 @@ class LogContents:
     def decoder(self, topic: str) -> Decoder:
         """Return a decoder for a topic that uses the definition stored in the file.
 
-        Raises
-        ------
-        InputError
-            If the topic is not in the log.
-        RecordingError
-            If its definition is missing or cannot be parsed.
+        Raises `InputError` if the topic is not in the log. Raises `RecordingError` if its
+        definition is missing or cannot be parsed.
         """
         info = self._topic(topic)
         return Decoder(info.type, info.definition)

@@ -104,13 +104,8 @@ class TopicChoice:
         """Return the Float64 topics to read and the signal of each.
 
         ``types`` gives the type of every topic of the recording, ``path`` is for error messages.
-
-        Raises
-        ------
-        InputError
-            If several topics match a signal, or a wanted topic is missing.
-        RecordingError
-            If a wanted topic is of another type.
+        Raises `InputError` if several topics match a signal, or a wanted topic is missing. Raises
+        `RecordingError` if a wanted topic is of another type.
         """
         chosen: dict[str, Signal] = {}
         for info in SIGNALS:

@@ -45,14 +45,10 @@ def outputs_in(log: LogContents) -> list[str]:
 def write_outputs(log: LogContents, kind: str, path: Path) -> int:
     """Write the messages of one kind as CSV or Parquet (by suffix); return the number of rows.
 
-    The columns are ``time`` (UTC) and ``unit_tag`` of the header, the topic, and the fields of
-    the message. Health has one row per status. An array is a list in Parquet and JSON in CSV.
-    A time of zero is an empty cell; in CSV a number that is not finite is an empty cell, too.
-
-    Raises
-    ------
-    RecordingError
-        If the recording lacks a definition, or a message does not match it.
+    The columns are ``time`` (UTC) and ``unit_tag`` of the header, the topic, and the fields of the
+    message. Health has one row per status. An array is a list in Parquet and JSON in CSV. A time
+    of zero is an empty cell; in CSV a number that is not finite is an empty cell, too. Raises
+    `RecordingError` if the recording lacks a definition, or a message does not match it.
     """
     topics = [t for t in log.topics.values() if t.type == OUTPUTS[kind] and t.count]
     types = parse_all(topics[0].type, topics[0].definition)

@@ -37,6 +37,8 @@ def _os_error(number: int, path: Path) -> OSError:
 class PartFile:
     """A file on disk that is being written.
 
+    Raises `FileExistsError` if the ``.part`` file already exists.
+
     Parameters
     ----------
     path : Path
@@ -44,11 +46,6 @@ class PartFile:
     replace : bool
         Replace an unlocked ``.part`` file that a dead writer left, and on `publish` a file that
         has the final name.
-
-    Raises
-    ------
-    OSError
-        `FileExistsError` if the ``.part`` file already exists.
     """
 
     def __init__(self, path: Path, replace: bool = False) -> None:

@@ -48,6 +48,9 @@ def open_log(
 ) -> LogContents:
     """Return the contents of a log.
 
+    Raises `RecordingError` if nothing can be read. Raises `InputError` if it is unclear which
+    topic or column holds a signal.
+
     Parameters
     ----------
     path : str or Path
@@ -59,13 +62,6 @@ def open_log(
         Contract names that a table may lack.
     table : TableOptions
         What the user says about a table.
-
-    Raises
-    ------
-    RecordingError
-        If nothing can be read.
-    InputError
-        If it is unclear which topic or column holds a signal.
     """
     place = Path(path)
     names = dict(columns or {})

@@ -44,10 +44,7 @@ class Source(AbstractContextManager['Source']):
     def open(cls, path: str | Path) -> Source:
         """Open a regular file, without blocking on a FIFO or a device.
 
-        Raises
-        ------
-        RecordingError
-            If it is absent, unreadable, empty, or not a regular file.
+        Raises `RecordingError` if it is absent, unreadable, empty, or not a regular file.
         """
         name = str(path)
         try:

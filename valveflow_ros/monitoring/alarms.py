@@ -572,12 +572,8 @@ class Alarms:
     ) -> list[AlarmChange]:
         """Apply an operator action to the alarm of a name, or to all; return the announcements.
 
-        ``judged`` is the last one, by the curve ``model_id``.
-
-        Raises
-        ------
-        DataError
-            There is no alarm of that name, or the action applies to none of them.
+        ``judged`` is the last one, by the curve ``model_id``. Raises `DataError` if there is no
+        alarm of that name, or the action applies to none of them.
         """
         meant = [alarm for alarm in self._all if name in (None, alarm.NAME)]
         if not meant:

@@ -163,10 +163,8 @@ class DiagnosisRequests:
     ) -> list[Event]:
         """Request a diagnosis now.
 
-        Raises
-        ------
-        DataError
-            One is running, there is no curve, or there is less than a day of data.
+        Raises `DataError` if one is running, there is no curve, or there is less than a day of
+        data.
         """
         now = _Now(time_ns, window, curve, since_ns)
         if objection := self._objection(now):

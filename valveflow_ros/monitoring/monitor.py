@@ -153,10 +153,8 @@ class Monitor(Memory):
     def reconfigure(self, settings: Settings) -> list[Event]:
         """Apply settings in which only live parameters differ.
 
-        Raises
-        ------
-        ParameterError
-            A parameter differs that cannot be changed while the monitor runs.
+        Raises `ParameterError` if a parameter differs that cannot be changed while the monitor
+        runs.
         """
         changed = self.settings.live_changes(settings)
         if not changed:
@@ -232,10 +230,7 @@ class Monitor(Memory):
     def request_fit(self) -> list[Event]:
         """Request a fit now.
 
-        Raises
-        ------
-        DataError
-            A fit is already running, or there is nothing to fit.
+        Raises `DataError` if a fit is already running, or there is nothing to fit.
         """
         if self.fit_pending:
             raise DataError('A fit is running already.')
@@ -254,10 +249,8 @@ class Monitor(Memory):
     def operate_alarms(self, action: AlarmAction, name: str | None = None) -> list[Event]:
         """Acknowledge, shelve or unshelve all alarms, or the one of a name.
 
-        Raises
-        ------
-        DataError
-            There is no alarm of that name, or the action applies to none of them.
+        Raises `DataError` if there is no alarm of that name, or the action applies to none of
+        them.
         """
         model_id = self._model_id()
         changes = self._alarms.operate(action, self.judged, model_id, name)
@@ -269,12 +262,7 @@ class Monitor(Memory):
 
         It is used for predictions and to judge later curves. Existing faults are thereby accepted.
         A given curve is written to the journal completely, because it cannot be computed from the
-        data of this run.
-
-        Raises
-        ------
-        DataError
-            There is no curve, or its input u is another one.
+        data of this run. Raises `DataError` if there is no curve, or its input u is another one.
         """
         curve = self.characteristic if given is None else given
         if curve is None:
@@ -306,18 +294,13 @@ class Monitor(Memory):
         """Continue from a state of the settings ``then`` or another version, as far as possible.
 
         Call it before the first row. A few rows may be missing in between, and the time may have
-        jumped.
+        jumped. Raises `DataError` if no part of the state can be used.
 
         Returns
         -------
         tuple of str and list of Event
             Sentences on what changed, was computed again or was discarded; and the journal entry
             with the parameters that changed.
-
-        Raises
-        ------
-        DataError
-            No part of the state can be used.
         """
         changed = self.settings.changes(then)
         depends = max((parameter(n).depends for n in changed), default=Depends.NOTHING)

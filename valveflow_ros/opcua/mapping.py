@@ -139,12 +139,8 @@ class GatewayMapping:
 def read_mapping_file(path: str | Path) -> GatewayMapping:
     """Read and check a mapping file.
 
-    Raises
-    ------
-    RecordingError
-        If it, or a file that it names, cannot be read.
-    InputError
-        If something in it is invalid; the message says where and why.
+    Raises `RecordingError` if it, or a file that it names, cannot be read. Raises `InputError` if
+    something in it is invalid; the message says where and why.
     """
     path = Path(path).expanduser()
     try:

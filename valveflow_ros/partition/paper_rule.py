@@ -42,12 +42,8 @@ def paper_rule(
 
     The costs are Omega(1), Omega(2), ...; those up to ``exact`` are taken as zero. J is never 1
     and never J_max: the rule compares the decrease of log Omega from J - 1 to J with that from J
-    to J + 1, and one of them does not exist at these ends.
-
-    Raises
-    ------
-    DataError
-        There are fewer than three costs, or one is negative or not finite.
+    to J + 1, and one of them does not exist at these ends. Raises `DataError` if there are fewer
+    than three costs, or one is negative or not finite.
 
     Notes
     -----
@@ -87,12 +83,8 @@ def select(partition: Partition, correlation_inflation: float = 1.0) -> Selectio
     """Choose J by eq. (24).
 
     ``correlation_inflation`` is the ratio of the variance of a long mean of the residual to that
-    of independent samples, at least 1.
-
-    Raises
-    ------
-    ParameterError
-        ``correlation_inflation`` is below 1 or not a number.
+    of independent samples, at least 1. Raises `ParameterError` if ``correlation_inflation`` is
+    below 1 or not a number.
 
     Notes
     -----

@@ -247,6 +247,11 @@ def partition(
 ) -> Partition:  # fmt: skip
     """Partition samples exactly into 1, 2, ... ``max_pieces`` straight pieces.
 
+    Raises `DataError` if the lengths differ, a value is not a finite number below 1e100, u is
+    constant, or a weight is not between 1e-6 and 1e6. Raises `TooFewSamplesError` if there are too
+    few distinct u for one piece. Raises `ParameterError` if ``max_pieces``, ``min_distinct`` or
+    ``threads`` is too small.
+
     Parameters
     ----------
     u, y : array_like (n,)
@@ -261,16 +266,6 @@ def partition(
     threads : int, optional
         1 starts no threads. By default all available cores are used for large inputs.
         The result does not depend on the number of threads.
-
-    Raises
-    ------
-    DataError
-        The lengths differ, a value is not a finite number below 1e100, u is constant, or a
-        weight is not between 1e-6 and 1e6.
-    TooFewSamplesError
-        There are too few distinct u for one piece.
-    ParameterError
-        ``max_pieces``, ``min_distinct`` or ``threads`` is too small.
 
     Notes
     -----

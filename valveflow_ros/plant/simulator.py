@@ -125,13 +125,9 @@ def simulate(
     The seed determines every random number; they do not depend on the effects, whose order has no
     influence, and a longer run begins with the shorter one. ``start_ns`` determines the time of
     day in UTC. A row needs about 90 bytes, and twice this while the parts are joined: ten days at
-    1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`.
-
-    Raises
-    ------
-    InputError
-        ``days``, ``seed`` or ``start_ns`` is out of range, or effects cannot
-        act in this run or not together.
+    1 s need 160 MB, a year 6 GB. For long runs use `simulate_parts`. Raises `InputError` if
+    ``days``, ``seed`` or ``start_ns`` is out of range, or effects cannot act in this run or not
+    together.
     """
     return SimulatedLog.joined(list(simulate_parts(days, seed, unit, start_ns, effects)))
 

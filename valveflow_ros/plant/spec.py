@@ -43,13 +43,9 @@ class EffectSpec:
     def parse(cls, text: str, known: Mapping[str, Effect] | None = None) -> EffectSpec:
         """Read ``NAME`` or ``NAME:key=value,...``; other parameters keep their defaults.
 
-        ``known`` are the effects by name, by default those of the catalogue.
-
-        Raises
-        ------
-        InputError
-            Unknown effect or parameter, a value that is missing, no number or out
-            of range, or a parameter given twice; the message lists the known names.
+        ``known`` are the effects by name, by default those of the catalogue. Raises `InputError`
+        for an unknown effect or parameter, a value that is missing, no number or out of range, or
+        a parameter given twice; the message lists the known names.
         """
         name, colon, rest = text.strip().partition(':')
         effect = _lookup(name.strip(), known or catalogue())

@@ -130,12 +130,8 @@ def simulate_thermal(
 
     The seed determines every random number, for all effects of `thermal_catalogue`, whose order
     has no influence, and all recordings. ``start_ns`` determines the time of day in UTC. By
-    default the unit is of the kind 'choked' and every sample is stored.
-
-    Raises
-    ------
-    InputError
-        An argument is out of range, or effects cannot act in this run or not together.
+    default the unit is of the kind 'choked' and every sample is stored. Raises `InputError` if an
+    argument is out of range, or effects cannot act in this run or not together.
     """
     unit, historian = unit or ThermalUnit(), historian or Historian()
     if not 0.0 < days <= LONGEST_DAYS:

@@ -263,12 +263,8 @@ def random_unit(kind: str, number: int) -> ThermalUnit:
     """Draw a unit of a kind; the same number gives the same unit.
 
     The breakpoints are in the valve's range of operation, the pressure of a sliding unit is
-    between 7 and 18 MPa, and the valve has a reserve at full load.
-
-    Raises
-    ------
-    InputError
-        Unknown kind, or a number below 0.
+    between 7 and 18 MPa, and the valve has a reserve at full load. Raises `InputError` for an
+    unknown kind, or a number below 0.
     """
     if kind not in KINDS:
         raise InputError(f"There is no unit '{kind}': use one of {', '.join(KINDS)}.")
@@ -343,13 +339,9 @@ _OPTIONS = ('number', 'vacuum_per_kpa', 'temperature_per_k')
 def unit_of(text: str) -> ThermalUnit:
     """Read ``KIND`` or ``KIND:key=value,...``.
 
-    Keys are ``number`` (the number of the unit for `random_unit`, default 0),
-    ``vacuum_per_kpa`` and ``temperature_per_k``.
-
-    Raises
-    ------
-    InputError
-        Unknown kind or key, or a value that is no number or out of range.
+    Keys are ``number`` (the number of the unit for `random_unit`, default 0), ``vacuum_per_kpa``
+    and ``temperature_per_k``. Raises `InputError` for an unknown kind or key, or a value that is
+    no number or out of range.
     """
     kind, _, rest = text.strip().partition(':')
     given = assignments(rest, f"Unit '{kind}'", _OPTIONS)

@@ -39,10 +39,7 @@ _NUMBERS = ('x', 'y', 'z', 'customdata', 'hovertext')  # numeric entries of a tr
 def check_drawing() -> None:
     """Raise early if figures cannot be drawn.
 
-    Raises
-    ------
-    InputError
-        matplotlib is not installed, or cannot be loaded.
+    Raises `InputError` if matplotlib is not installed, or cannot be loaded.
     """
     same = 'report.html has the same pictures and needs no library.'
     if find_spec('matplotlib') is None:
@@ -69,10 +66,7 @@ def palette() -> Mapping[str, str]:
 def figure_files(figure: Figure) -> dict[str, bytes]:
     """Return a figure as files by name: ``curve.png`` and ``curve.svg``.
 
-    Raises
-    ------
-    InputError
-        matplotlib is not installed.
+    Raises `InputError` if matplotlib is not installed.
     """
     check_drawing()
     from matplotlib import rc_context

@@ -84,10 +84,7 @@ _SHIFT = 'curve_shift'
 def moment_of(type_name: str, fields: Mapping[str, Any]) -> Moment | None:
     """Return the entry of a history for a message; None if there is nothing to show.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        The message cannot be read.
+    Raises `KeyError`, `TypeError` or `ValueError` if the message cannot be read.
     """
     time_ns, view = decoded(type_name, fields)
     if isinstance(view, AlarmView):

@@ -33,10 +33,7 @@ def read_text(name: str) -> str:
 def plotly_script() -> Path:
     """Return the path of plotly.js without importing plotly, which is slow.
 
-    Raises
-    ------
-    InputError
-        plotly is missing or incomplete.
+    Raises `InputError` if plotly is missing or incomplete.
     """
     spec = find_spec('plotly')
     if spec is None or spec.origin is None:

@@ -57,10 +57,7 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
 def declare(node: Node, table: Iterable[Parameter] = TABLE) -> dict[str, object]:
     """Declare parameters and return their given values, each of them checked.
 
-    Raises
-    ------
-    ParameterError
-        If a value does not match its row in the table.
+    Raises `ParameterError` if a value does not match its row in the table.
     """
     values: dict[str, object] = {}
     for row in table:
@@ -131,12 +128,8 @@ _POLICIES = {'history': ('keep_last', 'keep_all'), 'reliability': ('reliable', '
 def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list[str]:
     """Return a sentence for each QoS override that is for none of our topics.
 
-    ``topics`` are full names by 'publisher' and 'subscription'.
-
-    Raises
-    ------
-    ParameterError
-        If an override has an invalid value.
+    ``topics`` are full names by 'publisher' and 'subscription'. Raises `ParameterError` if an
+    override has an invalid value.
     """
     given: Mapping[str, RosParameter] = getattr(node, '_parameter_overrides', {})
     known = {
@@ -162,10 +155,7 @@ def check_qos_overrides(node: Node, topics: Mapping[str, Iterable[str]]) -> list
 def inputs(node: Node, settings: Settings) -> dict[str, str]:
     """Return the full name of each topic to which the monitor subscribes, by name of the input.
 
-    Raises
-    ------
-    ParameterError
-        If a covariate has a name or a topic that cannot be used.
+    Raises `ParameterError` if a covariate has a name or a topic that cannot be used.
     """
     check_names(settings)
     found: dict[str, str] = {}
@@ -187,12 +177,8 @@ def inputs(node: Node, settings: Settings) -> dict[str, str]:
 def changed(settings: Settings, wanted: Iterable[RosParameter], *, running: bool) -> Settings:
     """Return settings with some parameters changed.
 
-    While ``running``, only live parameters may change.
-
-    Raises
-    ------
-    ParameterError
-        If a parameter may not be changed now, is invalid, or conflicts with another one.
+    While ``running``, only live parameters may change. Raises `ParameterError` if a parameter may
+    not be changed now, is invalid, or conflicts with another one.
     """
     values = {}
     for item in wanted:

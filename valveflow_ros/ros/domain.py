@@ -143,11 +143,8 @@ def check_security(
 ) -> None:
     """Check that a node can be created with security, if security is required.
 
-    Raises
-    ------
-    InsecureError
-        If security is required with a word that ROS ignores, or without being enforced, or the
-        middleware cannot provide it.
+    Raises `InsecureError` if security is required with a word that ROS ignores, or without being
+    enforced, or the middleware cannot provide it.
     """
     environ = os.environ if environ is None else environ
     if not security_wanted(environ):
@@ -204,6 +201,8 @@ _NAME = '_valveflow_starting'
 class Presence:
     """Joins the domain on construction and initialises the default context.
 
+    Raises `ValveflowError` if ROS could not be started.
+
     Parameters
     ----------
     args : sequence of str, optional
@@ -213,11 +212,6 @@ class Presence:
         is not Fast DDS or security is required, since a policy accepts only known node names.
     environ : mapping, optional
         Environment variables for security; by default those of the process.
-
-    Raises
-    ------
-    ValveflowError
-        If ROS could not be started.
     """
 
     def __init__(

@@ -207,10 +207,8 @@ def diagnosis_message(
 ) -> Diagnosis:
     """Return the content of a `diagnosis.json` as a message.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError, AssertionError
-        If the content is incomplete or invalid.
+    Raises `KeyError`, `TypeError`, `ValueError` or `AssertionError` if the content is
+    incomplete or invalid.
     """
     message = no_diagnosis_message(str(content['sentence']), tag, task)
     message.verdict = VERDICTS[content['verdict']]
@@ -265,10 +263,7 @@ _Writer = Callable[[bytearray, Any], None]
 def encode(message: Any) -> bytes:
     """Return a message serialised as CDR.
 
-    Raises
-    ------
-    TypeError
-        If a field has a type that is not supported.
+    Raises `TypeError` if a field has a type that is not supported.
     """
     out = bytearray()
     _write_message(out, message)

@@ -46,10 +46,7 @@ class StopFlag:
     def cutting(self) -> Iterator[None]:
         """Let signals raise `Stopped` in the block, for work that may be interrupted.
 
-        Raises
-        ------
-        Stopped
-            If a signal arrives or has arrived before.
+        Raises `Stopped` if a signal arrives or has arrived before.
         """
         if self:
             raise Stopped
@@ -181,12 +178,8 @@ class UnitOfHost(NamedTuple):
 def read_units(path: str | Path) -> list[UnitOfHost]:
     """Read the list of units for `units.launch.py`.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be read, or a file that it names does not exist.
-    InputError
-        If it is no list of units, or two units have the same namespace.
+    Raises `RecordingError` if it cannot be read, or a file that it names does not exist. Raises
+    `InputError` if it is no list of units, or two units have the same namespace.
     """
     import yaml
 

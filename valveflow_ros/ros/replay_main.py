@@ -101,10 +101,7 @@ def input_topics(log: LogContents) -> dict[str, str]:
 def steps_of(log: LogContents) -> tuple[list[str], Iterator[Step]]:
     """Return the inputs that will be published, and the steps.
 
-    Raises
-    ------
-    DataError
-        If there is nothing to play.
+    Raises `DataError` if there is nothing to play.
     """
     if not log.topics:
         names = [SIGNALS[signal].topic for signal in sorted(log.signals)]

@@ -76,11 +76,7 @@ def verify(path: str | Path, progress: Callable[[float], None] = lambda _: None)
     """Compare a recording with its replay.
 
     ``progress`` is called from time to time with the fraction of the inputs that was processed.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or is no recording of the monitor.
+    Raises `RecordingError` if the file cannot be read, or is no recording of the monitor.
     """
     return _Replay(open_log(path), progress).verify()
 
@@ -88,10 +84,7 @@ def verify(path: str | Path, progress: Callable[[float], None] = lambda _: None)
 def corrector_of_run(log: LogContents, settings: Settings) -> Corrector | None:
     """Return the corrector of the rows in the recorded run, None if there was none.
 
-    Raises
-    ------
-    RecordingError
-        If the model is not in the recording, or cannot be used.
+    Raises `RecordingError` if the model is not in the recording, or cannot be used.
     """
     if not settings.text(parameter_files.MODEL_FILE):
         return None

@@ -139,10 +139,8 @@ def air_in(signal: Signal, name: str) -> float:
 def unit_of(signal: Signal, name: str) -> Unit:
     """Return a unit by its name, which is not case-sensitive.
 
-    Raises
-    ------
-    InputError
-        The unit is not valid for this signal; the message lists the valid units.
+    Raises `InputError` if the unit is not valid for this signal; the message lists the valid
+    units.
     """
     for spelling, unit in known_units(signal).items():
         if spelling.lower() == name.strip().lower():

@@ -250,10 +250,7 @@ class Definitions:
     def text(self, type_name: str) -> str:
         """Return the definition of a type followed by those of all types it needs.
 
-        Raises
-        ------
-        RecordingError
-            If a definition is not found or cannot be parsed.
+        Raises `RecordingError` if a definition is not found or cannot be parsed.
         """
         main, *others = self._needed(type_name)
         parts = [self._texts[main]]

@@ -77,6 +77,9 @@ def write_readings(
 ) -> WrittenLog:
     """Write readings block by block, each signal as a ``std_msgs/Float64`` topic of its name.
 
+    Raises `DataError` if there is nothing to write. Raises `RecordingError` if the file exists or
+    cannot be written.
+
     Parameters
     ----------
     blocks : iterable of Readings
@@ -93,13 +96,6 @@ def write_readings(
         Replace an existing file.
     further : sequence of str
         Topics of further columns, whose readings have the numbers after those of the signals.
-
-    Raises
-    ------
-    DataError
-        If there is nothing to write.
-    RecordingError
-        If the file exists or cannot be written.
     """
     place = Path(path)
     target = place if place.suffix == '.mcap' else place / f'{place.resolve().name}_0.mcap'

@@ -239,10 +239,10 @@ def free_bytes_of(folder: Path) -> int:
 class Recorder:
     """Writes messages to a recording folder in a separate thread.
 
-    Unfinished files of a recorder that died are recovered first. After a disk
-    error the current file is left for `recover`, and a new one is begun when
-    writing works again. Meanwhile messages wait; if too many wait, the newest
-    are dropped and counted.
+    Unfinished files of a recorder that died are recovered first. After a disk error the current
+    file is left for `recover`, and a new one is begun when writing works again. Meanwhile messages
+    wait; if too many wait, the newest are dropped and counted. Raises `RecordingError` if the
+    folder cannot be created.
 
     Parameters
     ----------
@@ -254,11 +254,6 @@ class Recorder:
         As in `RecordingWriter`.
     free_bytes : callable
         Returns the free bytes on the disk of a folder.
-
-    Raises
-    ------
-    RecordingError
-        If the folder cannot be created.
     """
 
     def __init__(
@@ -307,6 +302,9 @@ class Recorder:
     ) -> None:
         """Add a topic before its first message; adding it again changes nothing.
 
+        Raises `InputError` if the topic is already recorded with another type. Raises
+        `RecordingError` if the definition of the type is not found or cannot be parsed.
+
         Parameters
         ----------
         topic, type_name : str
@@ -315,13 +313,6 @@ class Recorder:
             QoS profile of each of its publishers.
         latched : bool
             If True, its last message is repeated at the start of every later split.
-
-        Raises
-        ------
-        InputError
-            If the topic is already recorded with another type.
-        RecordingError
-            If the definition of the type is not found or cannot be parsed.
         """
         known = self._topics.get(topic)
         if known is not None:
@@ -336,16 +327,14 @@ class Recorder:
     def record(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
         """Queue a message of raw CDR bytes; never waits for the disk.
 
+        Raises `InputError` if the topic was not added, or a time is outside of the range of a
+        recording.
+
         Returns
         -------
         bool
             False if it was dropped and counted as such, because too many
             messages are waiting or the recorder was closed.
-
-        Raises
-        ------
-        InputError
-            If the topic was not added, or a time is outside of the range of a recording.
         """
         if topic not in self._topics:
             raise InputError(f"Topic '{topic}' was not made known to the recorder.")

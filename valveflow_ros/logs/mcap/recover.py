@@ -87,7 +87,8 @@ def recover(
     """Copy the intact chunks of ``path`` into a finished file ``out``.
 
     It gets its final name after the library `mcap` has read its summary and every chunk and
-    verified the checksums.
+    verified the checksums. Raises `RecordingError` if ``path`` holds no message, ``out`` exists or
+    cannot be written, or other programs could not read it.
 
     Parameters
     ----------
@@ -97,12 +98,6 @@ def recover(
         The new file, which must not exist; its name should end in ``.mcap``.
     progress : callable, optional
         Called with the bytes done and the total bytes.
-
-    Raises
-    ------
-    RecordingError
-        If ``path`` holds no message, ``out`` exists or cannot be written, or other programs
-        could not read it.
     """
     target = Path(out)
     if target.exists():
@@ -122,14 +117,9 @@ def intact_messages(path: Path) -> int:
 def recover_leftovers(folder: str | Path) -> tuple[RecoveryReport, ...]:
     """Finish every ``.part`` file in a folder that no living recorder holds.
 
-    The ``.part`` file is removed when its finished file is in place, or if it has no
-    complete chunk. It is kept if it cannot be read, or has damaged chunks only. The
-    folder's `metadata.yaml` is updated.
-
-    Raises
-    ------
-    RecordingError
-        If the folder cannot be read.
+    The ``.part`` file is removed when its finished file is in place, or if it has no complete
+    chunk. It is kept if it cannot be read, or has damaged chunks only. The folder's
+    `metadata.yaml` is updated. Raises `RecordingError` if the folder cannot be read.
     """
     home = Path(folder)
     with os_errors(home, 'leftovers cannot be recovered'):
@@ -281,10 +271,7 @@ class _Copier:
     def complete(self) -> None:
         """Read the topic records of the whole file, also those outside of chunks.
 
-        Raises
-        ------
-        RecordingError
-            If the summary contradicts the chunks.
+        Raises `RecordingError` if the summary contradicts the chunks.
         """
         if self._whole:
             return

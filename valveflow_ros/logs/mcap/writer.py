@@ -74,12 +74,8 @@ class TopicRegistry:
     ) -> None:
         """Add a topic; adding it again changes nothing.
 
-        Raises
-        ------
-        InputError
-            If the topic was added before with another type.
-        RecordingError
-            If the definition of the type is not found.
+        Raises `InputError` if the topic was added before with another type. Raises
+        `RecordingError` if the definition of the type is not found.
         """
         if topic in self.ids:
             have = self.table.type_of(self.table.channels[self.ids[topic]])
@@ -150,12 +146,12 @@ class _File:
 class RecordingWriter:
     """Writes to one recording folder, from one thread.
 
-    An existing folder is continued: the numbers of the splits go on, and
-    `metadata.yaml` covers all finished splits. A file is created with its
-    first chunk. After a `RecordingError` the current file is abandoned. The
-    messages that were not on disk are kept, and the next `flush` writes them
-    to a new file. If another program removed the file or the folder, a new
-    one is created, and the messages in it are counted as lost.
+    An existing folder is continued: the numbers of the splits go on, and `metadata.yaml` covers
+    all finished splits. A file is created with its first chunk. After a `RecordingError` the
+    current file is abandoned. The messages that were not on disk are kept, and the next `flush`
+    writes them to a new file. If another program removed the file or the folder, a new one is
+    created, and the messages in it are counted as lost. Raises `RecordingError` if the folder
+    cannot be created or used.
 
     Attributes
     ----------
@@ -180,11 +176,6 @@ class RecordingWriter:
         Returns the latched messages that are repeated at the start of every split but the first.
     open_file : callable
         Opens a split for writing.
-
-    Raises
-    ------
-    RecordingError
-        If the folder cannot be created or used.
     """
 
     def __init__(
@@ -237,12 +228,8 @@ class RecordingWriter:
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add a message of raw CDR bytes; every 64 KiB of messages are written as a chunk.
 
-        Raises
-        ------
-        RecordingError
-            If a chunk could not be written; the message is kept.
-        KeyError
-            If the topic was not added.
+        Raises `RecordingError` if a chunk could not be written; the message is kept. Raises
+        `KeyError` if the topic was not added.
         """
         channel = self._topics.ids[topic]
         sequence = self._sequences.get(channel, self._before) + 1
@@ -283,11 +270,7 @@ class RecordingWriter:
 
         If another program removed or replaced them, the folder is created again and the split is
         abandoned. Its messages are counted as lost, and the next `flush` begins a new split.
-
-        Raises
-        ------
-        RecordingError
-            If the check fails, or the folder cannot be created.
+        Raises `RecordingError` if the check fails, or the folder cannot be created.
         """
         with os_errors(self.folder, 'cannot be made'):
             make_folder(self.folder)

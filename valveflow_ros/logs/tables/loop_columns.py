@@ -65,6 +65,9 @@ def read_loop_columns(
 ) -> LoopColumns:
     """Return the columns of a loop from a table.
 
+    Raises `RecordingError` if the file cannot be read as a table. Raises `InputError` if a column
+    is missing or ambiguous.
+
     Parameters
     ----------
     path : Path
@@ -73,13 +76,6 @@ def read_loop_columns(
         Columns named by the user, by role or ``time``; the others are recognised by their names.
     options : TableOptions
         What the user says about the table.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read as a table.
-    InputError
-        If a column is missing or ambiguous.
     """
     import pandas as pd
 

@@ -104,6 +104,9 @@ def read_table(
 ) -> RawTable:
     """Return the table in a file.
 
+    Raises `RecordingError` if the file cannot be read as a table. Raises `InputError` if a column
+    is missing or ambiguous, or a contract name is unknown.
+
     Parameters
     ----------
     path : str or Path
@@ -116,13 +119,6 @@ def read_table(
         Contract names that may be missing.
     options : TableOptions
         What the user says about the table.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read as a table.
-    InputError
-        If a column is missing or ambiguous, or a contract name is unknown.
     """
     return whole_table(TableReader(Path(path), columns or {}, absent, options))
 
@@ -186,10 +182,11 @@ def write_table(
 ) -> None:
     """Write a table with the columns of the contract.
 
-    Times are ISO 8601 in UTC with as many digits as they need. Numbers have
-    enough digits to be read back exactly; a missing value is an empty cell. An
-    optional signal without values gets no column. A signal with values of
-    uncertain quality gets an additional column of quality codes.
+    Times are ISO 8601 in UTC with as many digits as they need. Numbers have enough digits to be
+    read back exactly; a missing value is an empty cell. An optional signal without values gets no
+    column. A signal with values of uncertain quality gets an additional column of quality codes.
+    Raises `InputError` if the suffix is another one. Raises `RecordingError` if the file cannot be
+    written, or is Parquet and pyarrow is not installed.
 
     Parameters
     ----------
@@ -197,13 +194,6 @@ def write_table(
         ``.csv`` or ``.parquet``; replaced if it exists.
     extra : mapping of str to float64 (n,), optional
         Further columns by name, after the signals.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one.
-    RecordingError
-        If the file cannot be written, or is Parquet and pyarrow is not installed.
     """
     place = Path(path)
     kind = place.suffix.lower()

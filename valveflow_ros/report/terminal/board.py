@@ -140,10 +140,7 @@ def decoded(
 ) -> tuple[int, CurveView | SampleView | AlarmView | DiagnosisView]:
     """Return a message of one of `MESSAGES`: its time stamp in ns, and its content.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        A field is missing, or has a wrong type.
+    Raises `KeyError`, `TypeError` or `ValueError` if a field is missing, or has a wrong type.
     """
     time_ns = _ns(fields['header']['stamp'])
     if type_name == PREDICTION:

@@ -211,12 +211,8 @@ def _logged(transition: _Transition) -> _Transition:
 class MonitorNode(LifecycleNode):
     """The monitor as a managed node.
 
-    ``stop`` returns True if the process must end, ``args`` is the command line.
-
-    Raises
-    ------
-    ParameterError
-        If the parameters given at the start are invalid.
+    ``stop`` returns True if the process must end, ``args`` is the command line. Raises
+    `ParameterError` if the parameters given at the start are invalid.
     """
 
     def __init__(

@@ -46,10 +46,7 @@ def tag_of(settings: Settings) -> str:
 def expand_home(name: str) -> Path:
     """Return an absolute path, with ``~`` expanded.
 
-    Raises
-    ------
-    RecordingError
-        The user after ``~`` is unknown.
+    Raises `RecordingError` if the user after ``~`` is unknown.
     """
     try:
         return Path(name).expanduser().absolute()
@@ -79,10 +76,7 @@ def new_folder(settings: Settings, at_s: float) -> Path:
 def check_record_directory(settings: Settings) -> None:
     """Check that ``record_directory`` can be created and written to; create nothing.
 
-    Raises
-    ------
-    RecordingError
-        If not, with the reason and advice.
+    Raises `RecordingError` if not, with the reason and advice.
     """
     if not settings.flag('record'):
         return

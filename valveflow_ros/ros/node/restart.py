@@ -148,12 +148,8 @@ class Restart:
     ) -> Iterator[Output]:
         """Process what was recorded after the state was saved; yield outputs not recorded then.
 
-        Sentences about what could not be repeated are added to ``problems``.
-
-        Raises
-        ------
-        DataError
-            If the journal cannot be read.
+        Sentences about what could not be repeated are added to ``problems``. Raises `DataError` if
+        the journal cannot be read.
         """
         # An output before the first row has its log time as publish time; see `Session.record`.
         told = Counter(

@@ -64,12 +64,8 @@ class InUseError(RecordingError):
 class StateFolder:
     """A folder that is locked by one monitor as long as it runs; created if absent.
 
-    Raises
-    ------
-    InUseError
-        If another monitor keeps its state there.
-    RecordingError
-        If it cannot be created or used.
+    Raises `InUseError` if another monitor keeps its state there. Raises `RecordingError` if it
+    cannot be created or used.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -210,6 +206,8 @@ def state_folder(settings: Settings) -> Path | None:
 class StateStore:
     """Saves the state in a thread, and finds the state that an earlier run saved.
 
+    Raises `InUseError` if another monitor keeps its state in the same folder.
+
     Attributes
     ----------
     saved : State or None
@@ -222,11 +220,6 @@ class StateStore:
         Why the state cannot be saved; empty if it can.
     saved_s : float or None
         Monotonic time at which the last state was written.
-
-    Raises
-    ------
-    InUseError
-        If another monitor keeps its state in the same folder.
     """
 
     def __init__(self, settings: Settings) -> None:
