@@ -10,11 +10,7 @@ from ros_helpers import wait_until
 from std_msgs.msg import Float64
 
 from valveflow_ros.ros.encoding import encode, float64_bytes
-from valveflow_ros.ros.node.polled_subscription import (
-    DEPTH,
-    PolledSubscription,
-    can_poll,
-)
+from valveflow_ros.ros.node.polled_subscription import DEPTH, PolledSubscription
 
 pytestmark = pytest.mark.ros
 
@@ -55,19 +51,10 @@ def collect(source, count, executor=None):
     return found
 
 
-def test_this_rclpy_lets_messages_be_taken_by_hand(node):
-    # If this fails after an update of rclpy, the executor takes over (see the next tests);
-    # it costs about eight times the processor time, so better find the new way.
-    source = PolledSubscription(node, Float64, 'value')
-    assert can_poll(source._subscription)
-    assert source.polled
-
-
-@pytest.mark.parametrize('polled', [True, False])
-def test_bytes_stamps_and_numbers_come_in_order(node, polled):
+def test_bytes_stamps_and_numbers_come_in_order(node):
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    source = PolledSubscription(node, Float64, 'value', reliable=True, polled=polled)
+    source = PolledSubscription(node, Float64, 'value', reliable=True)
     publisher = publisher_for(node, source)
     wait_until(lambda: publisher.get_subscription_count() == 1, 'the match')
     before_ns = time.time_ns()
@@ -76,7 +63,6 @@ def test_bytes_stamps_and_numbers_come_in_order(node, polled):
         publisher.publish(Float64(data=value))
     found = collect(source, len(values), executor)
     after_ns = time.time_ns()
-    assert source.polled == polled
     assert [taken.data for taken in found] == [float64_bytes(value) for value in values]
     numbers = [taken.sequence for taken in found]
     assert numbers == list(range(numbers[0], numbers[0] + len(values)))

@@ -4,18 +4,16 @@
 
 An executor spends much more time on selecting callbacks than on the messages. Here the main loop
 polls each subscription for raw bytes, with the stamps and the sequence number from the
-middleware, and each service for a request. If this version of rclpy does not support polling, the
-executor calls back instead.
+middleware, and each service for a request.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -64,11 +62,6 @@ class _PolledGroup(CallbackGroup):
         """Do nothing, because `can_execute` has no state."""
 
 
-def can_poll(subscription: Subscription) -> bool:
-    """Return True if this version of rclpy supports polling."""
-    return callable(getattr(subscription.handle, 'take_message', None))
-
-
 class PolledSubscription:
     """A subscription that is polled.
 
@@ -82,8 +75,6 @@ class PolledSubscription:
         True to request reliable delivery; a best-effort subscription matches every publisher.
     on_mismatch : callable
         Called with the topic when the QoS of a publisher is incompatible.
-    polled : bool
-        False to let the executor call back even if polling is possible.
     """
 
     def __init__(
@@ -94,19 +85,24 @@ class PolledSubscription:
         *,
         reliable: bool = False,
         on_mismatch: Callable[[str], None] = lambda _: None,
-        polled: bool = True,
     ) -> None:
         self._node = node
         self._type = message_type
-        self._waiting: deque[RawMessage] = deque(maxlen=DEPTH)
-        self._polled = polled
-        self._make(topic, reliable, on_mismatch, _PolledGroup() if polled else None)
-        if polled and not can_poll(self._subscription):
-            node.destroy_subscription(self._subscription)
-            self._polled = False
-            self._make(topic, reliable, on_mismatch, None)
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self._subscription = node.create_subscription(
+            message_type,
+            topic,
+            lambda _: None,
+            QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability),
+            raw=True,
+            callback_group=_PolledGroup(),
+            qos_overriding_options=qos_overrides(node, topic, 'subscription'),
+            # Each event handler costs executor time in every cycle; the others are not used.
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda _: on_mismatch(self.topic), use_default_callbacks=False
+            ),
+        )
         self._handle = self._subscription.handle
-        self._take_message = getattr(self._handle, 'take_message', None)
         # Acquired once for the whole time, instead of for every poll.
         self._handle.__enter__()
 
@@ -115,18 +111,14 @@ class PolledSubscription:
         """Return the full name of the topic."""
         return str(self._subscription.topic_name)
 
-    @property
-    def polled(self) -> bool:
-        """Return True if messages are polled, False if the executor calls back."""
-        return self._polled
-
     def take(self, most: int = DEPTH) -> list[RawMessage]:
         """Return at most ``most`` messages that have arrived, oldest first."""
-        if not self._polled:
-            return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
         taken: list[RawMessage] = []
-        while len(taken) < most and (found := self._take_message(self._type, True)) is not None:
-            taken.append(_raw_message(*found))
+        while len(taken) < most and (found := self._handle.take_message(self._type, True)):
+            data, info = found
+            stamps = (info['source_timestamp'], info['received_timestamp'])
+            number = info['publication_sequence_number']
+            taken.append(RawMessage(data, *(int(n or 0) for n in (*stamps, number))))
         return taken
 
     def close(self) -> None:
@@ -134,39 +126,13 @@ class PolledSubscription:
         self._handle.__exit__(None, None, None)
         self._node.destroy_subscription(self._subscription)
 
-    def _make(
-        self,
-        topic: str,
-        reliable: bool,
-        on_mismatch: Callable[[str], None],
-        group: CallbackGroup | None,
-    ) -> None:
-        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        self._subscription = self._node.create_subscription(
-            self._type,
-            topic,
-            self._call_back,
-            QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability),
-            raw=True,
-            callback_group=group or MutuallyExclusiveCallbackGroup(),
-            qos_overriding_options=qos_overrides(self._node, topic, 'subscription'),
-            # Each event handler costs executor time in every cycle; the others are not used.
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda _: on_mismatch(self.topic), use_default_callbacks=False
-            ),
-        )
-
-    def _call_back(self, data: bytes, info: dict[str, Any]) -> None:
-        self._waiting.append(_raw_message(data, info))
-
 
 def answer_request(service: Service, failed: Callable[[str], None]) -> bool:
     """Answer the oldest request of a service; return False if there is none.
 
     If the callback fails, ``failed`` gets a sentence, and the response reports no success.
     """
-    take = getattr(service.handle, 'service_take_request', None)
-    request, header = (None, None) if take is None else take(service.srv_type.Request)
+    request, header = service.handle.service_take_request(service.srv_type.Request)
     if header is None:
         return False
     response = service.srv_type.Response()
@@ -186,12 +152,3 @@ def _refuse(request: Any, response: Any, reason: str) -> None:
         response.results += [SetParametersResult(successful=False, reason=reason)] * missing
     elif hasattr(response, 'result') and hasattr(response.result, 'reason'):
         response.result = SetParametersResult(successful=False, reason=reason)
-
-
-def _raw_message(data: bytes, info: dict[str, Any]) -> RawMessage:
-    return RawMessage(
-        data,
-        int(info['source_timestamp'] or 0),
-        int(info['received_timestamp'] or 0),
-        int(info['publication_sequence_number'] or 0),
-    )
