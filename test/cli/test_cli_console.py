@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from valveflow_ros.cli.command import Console, VerbResult, columns
+from valveflow_ros.cli.command import Console, VerbResult, table
 
 
 class Terminal(io.StringIO):
@@ -126,7 +126,8 @@ def test_a_picture_keeps_its_colours():
 
 @given(st.lists(st.lists(st.text('abc 12', max_size=9), min_size=3, max_size=3), max_size=6))
 def test_columns_line_up(rows):
-    lines = columns(rows, ['one', 'two', 'three'], indent='').split('\n')
+    told = table(['one', 'two', 'three'], rows)
+    lines = [line.removeprefix('  ') for line in told.split('\n')]
     assert len(lines) == len(rows) + 1
     width = max(map(len, lines))
     for line, row in zip(lines[1:], rows, strict=True):

@@ -19,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 from valveflow_ros.curve.characteristic import RegionDynamics
 from valveflow_ros.records import Signal
 from valveflow_ros.report import words
-from valveflow_ros.report.answer import dynamics_figure, dynamics_table
+from valveflow_ros.report.answer import dynamics_cells, dynamics_figure
 from valveflow_ros.report.curve import band, curve_figure, density
 from valveflow_ros.report.data import (
     coverage_figure,
@@ -211,7 +211,9 @@ def test_the_table_and_the_figure_of_dynamics_leave_out_what_is_not_known():
     sure = RegionDynamics(0.0, 200.0, 12.0, 2.0, 1.0, 0.5)
     unsure = replace(sure, power_from=200.0, power_to=300.0, time_constant_stderr_s=13.0)
     vague = replace(sure, delay_stderr_s=2.5)
-    found = [dynamics_table(d).count('not known') for d in ((sure,), (sure, unsure), (vague,))]
+    found = [
+        str(dynamics_cells(d)).count('not known') for d in ((sure,), (sure, unsure), (vague,))
+    ]
     assert found == [0, 2, 1]
     assert dynamics_figure((unsure,)) is None
     assert len(dynamics_figure((sure, unsure)).traces) == 1

@@ -224,7 +224,7 @@ def test_a_straight_curve_has_no_breakpoints(identified):
         identified, pieces=pieces, partition_pieces=pieces, breakpoint_intervals=()
     ))  # fmt: skip
     assert 'It is straight' in words_of(html)
-    assert 'break&shy;point' not in html
+    assert '>breakpoint<' not in html
     assert 'before refining' not in [t['name'] for t in figures_of(html)['curve']['data']]
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from valveflow_ros.interface.logs import Log
     from valveflow_ros.interface.mapping import LogMapping
 
+_INDENT = '  '  # of a table
 _TERMINAL = 80  # characters; a wider table has its head in several lines
 # Terminal control characters and those that change the text direction, except tabs and newlines.
 _COMMANDS = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]')
@@ -340,13 +341,15 @@ def lines(*parts: str) -> str:
     return '\n'.join(part for part in parts if part)
 
 
-def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str = '  ') -> str:
-    """Return rows with aligned columns; the first column left, the others right.
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return rows below their head, the first column left, the others right; empty without rows.
 
     If they are wider than a usual terminal, the head is broken into several lines.
     """
-    everything = [head, *rows] if head else rows
-    if head and rows and len(indent) + sum(w + 2 for w in _widths(everything)) > _TERMINAL:
+    if not rows:
+        return ''
+    everything = [head, *rows]
+    if len(_INDENT) + sum(w + 2 for w in _widths(everything)) > _TERMINAL:
         parts = (
             wrap(name, max(width, 1, *map(len, name.split())))[::-1]
             for name, width in zip(head, _widths(rows), strict=True)
@@ -356,17 +359,12 @@ def columns(rows: Sequence[Sequence[str]], head: Sequence[str] = (), indent: str
     told = []
     for row in everything:
         cells = [row[0].ljust(first), *map(str.rjust, row[1:], others)]
-        told.append((indent + '  '.join(cells)).rstrip())
+        told.append((_INDENT + '  '.join(cells)).rstrip())
     return '\n'.join(told)
 
 
 def _widths(rows: Sequence[Sequence[str]]) -> list[int]:
     return [max(map(len, column)) for column in zip(*rows, strict=True)]
-
-
-def table(rows: Sequence[Sequence[str]], head: Sequence[str]) -> str:
-    """Return rows below their head; nothing if there are none."""
-    return columns(rows, head) if rows else ''
 
 
 def rejected_words(

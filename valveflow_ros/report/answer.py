@@ -21,6 +21,7 @@ from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
 from valveflow_ros.report.figure import Figure, Spec
 from valveflow_ros.report.identified import Identified
+from valveflow_ros.report.page import Cells
 from valveflow_ros.report.words import NOT_KNOWN, Z95
 from valveflow_ros.signals.static_form import LEAST_PRESSURE_RANGE, OPENING, pressure_range
 
@@ -214,7 +215,7 @@ def _load_head(data: Identified) -> str:
     return f'{"flow" if unit in FLOW_UNITS else "load"} ({unit})'
 
 
-def gain_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
+def gain_cells(data: Identified) -> Cells:
     """Return head and cells of the table of MW per % of opening by load."""
     unit, gains = data.characteristic.output_unit, gain_by_load(data)
     digits = 1 if all(g.pressure_high > _SMALL_MPA for g in gains) else 3
@@ -246,10 +247,10 @@ def gain_table(data: Identified) -> str:
             ' The opening is the one that gives the load at the median pressure. The usual range '
             'of the pressure holds for nine tenths of the time at this load.'
         )
-    return html.table(head, cells, caption=caption) if cells else ''
+    return html.table(head, cells, caption=caption)
 
 
-def reference_cells(data: Identified) -> tuple[list[str], list[list[str]]]:
+def reference_cells(data: Identified) -> Cells:
     """Return head and cells of the curve against the reference by load, the largest load last.
 
     Both curves are read at the same opening and pressure; there are no cells without a reference.
@@ -291,7 +292,7 @@ def reference_table(data: Identified) -> str:
         'Both curves at the same opening and pressure. The last row is the largest load at which '
         'both are known.'
     )
-    return html.table(head, cells, caption=caption) if cells else ''
+    return html.table(head, cells, caption=caption)
 
 
 def answer_words(data: Identified) -> str:
@@ -368,8 +369,8 @@ def _bends(data: Identified) -> str:
     return said
 
 
-def pieces_table(data: Identified) -> str:
-    """Return a table with one row per piece."""
+def pieces_cells(data: Identified) -> Cells:
+    """Return head and cells with one row per piece."""
     c = data.shown
     m, u = c.pressure_exponent, say.input_name(c.pressure_exponent)
     rows = []
@@ -379,19 +380,23 @@ def pieces_table(data: Identified) -> str:
             str(k + 1), say.span(piece.u_from, piece.u_to, 1), say.span(low, high, 1),
             say.with_error(piece.slope, piece.slope_stderr),
             say.with_error(piece.intercept, piece.intercept_stderr), say.count(piece.samples),
-            *_rests(c, k),
         ])  # fmt: skip
     head = [
-        'piece', f'{u} ({say.input_unit(m)})', f'power{data.at_pressure} (MW)',
-        f'slope, 95 % ({say.per_input(m)})', 'intercept, 95 % (MW)',
-        'samples', *(['rests on'] if c.support else []),
+        'piece', f'{u} ({say.input_unit_plain(m)})', f'power{data.at_pressure} (MW)',
+        f'slope, 95 % ({say.per_input(m)})', 'intercept, 95 % (MW)', 'samples',
     ]  # fmt: skip
-    return html.table(head, rows)
+    return head, rows
 
 
-def _rests(c: Characteristic, k: int) -> list[str]:
+def pieces_table(data: Identified) -> str:
+    """Return the table of the pieces, with what each rests on."""
+    c, (head, rows) = data.shown, pieces_cells(data)
     if not c.support:
-        return []
+        return html.table(head, rows)
+    return html.table([*head, 'rests on'], [[*row, _rests(c, k)] for k, row in enumerate(rows)])
+
+
+def _rests(c: Characteristic, k: int) -> str:
     found = c.support[k]
     said = (
         f'{say.counted(found.steady, "steady state")} at '
@@ -399,27 +404,23 @@ def _rests(c: Characteristic, k: int) -> list[str]:
         f'{say.counted(found.slope_response, "slope response")}'
     )
     if found.identifiable:
-        return [said]
-    return [
-        f'{said}; the slope follows from {lends(c)}'
-        if is_borrowed(c.pieces[k])
-        else f'<b>slope uncertain</b>: {said}'
-    ]
+        return said
+    if is_borrowed(c.pieces[k]):
+        return f'{said}; the slope follows from {lends(c)}'
+    return f'<b>slope uncertain</b>: {said}'
 
 
-def breakpoints_table(c: Characteristic) -> str:
-    """Return a table with one row per breakpoint; empty for a straight curve."""
-    if len(c.pieces) < 2:
-        return ''
+def breakpoints_cells(c: Characteristic) -> Cells:
+    """Return head and cells with one row per breakpoint; no rows for a straight curve."""
     rows = [
         [str(k), say.level(piece.u_to, 1), say.interval(low, high), say.level(float(value), 1)]
         for k, (piece, (low, high), value) in enumerate(
             zip(c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True), 1
         )
     ]
-    unit = say.input_unit(c.pressure_exponent)
-    u = say.input_name(c.pressure_exponent)
-    return html.table(['break&shy;point', f'{u} ({unit})', '95 % interval', 'power (MW)'], rows)
+    m = c.pressure_exponent
+    u = f'{say.input_name(m)} ({say.input_unit_plain(m)})'
+    return ['breakpoint', u, '95 % interval', 'power (MW)'], rows
 
 
 def temperature_words(data: Identified) -> str:
@@ -446,7 +447,7 @@ def window_words(c: Characteristic) -> str:
 _LOOKS = (('chosen', 'solid'), ('steady', 'dash'), ('slope', 'dot'))
 
 
-def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
+def dynamics_cells(dynamics: tuple[RegionDynamics, ...]) -> Cells:
     """Return time constant and delay by region of power; 'not known' if below its error."""
     rows = [
         [
@@ -459,7 +460,7 @@ def dynamics_table(dynamics: tuple[RegionDynamics, ...]) -> str:
     ]
     head = ['power', 'time constant T, 95 % (s)', 'delay τ, 95 % (s)',
             '95 % done after τ + 3 T (s)']  # fmt: skip
-    return html.table(head, rows)
+    return head, rows
 
 
 def _told(region: RegionDynamics) -> bool:

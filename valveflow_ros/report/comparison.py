@@ -25,7 +25,7 @@ from valveflow_ros.records import NS_PER_S, FloatArray, SegmentKind
 from valveflow_ros.report import figure as plot
 from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
-from valveflow_ros.report.answer import choice_figure, dynamics_table
+from valveflow_ros.report.answer import choice_figure, dynamics_cells
 from valveflow_ros.report.comparison_tables import (
     LABELS,
     METHODS,
@@ -33,9 +33,9 @@ from valveflow_ros.report.comparison_tables import (
     curves_of,
     errors_table,
     pairs_table,
-    parameters_table,
+    parameters_cells,
     segments_table,
-    totals_table,
+    totals_cells,
 )
 from valveflow_ros.report.figure import Figure, Spec
 from valveflow_ros.report.page import Page, Section
@@ -186,16 +186,20 @@ def comparison_page(data: Compared) -> Page:
             pairs_table(data.result.pairs),
             *(html.paragraph(html.text(sentence)) for sentence in rest),
         ),
-        html.section('The curves', parameters_table(data)),
+        html.section(
+            'The curves',
+            html.table(*parameters_cells(data), caption="As in the paper's Table II."),
+        ),
         html.section('Against the truth', errors_table(data), truth_figure(data))
         if data.result.truth is not None else None,
         html.section(
-            'On data nobody has seen', totals_table(data),
+            'On data nobody has seen',
+            html.table(*totals_cells(data), caption='Mean squared errors on the test data.'),
             *(stretch_figure(data, s) for s in shown),
             segments_table(data, segments) if segments else None,
         ),
         html.section(
-            'Dynamics by load', dynamics_table(c.dynamics) if c.dynamics else None,
+            'Dynamics by load', html.table(*dynamics_cells(c.dynamics)),
             html.paragraph(html.text(_linear_block_words(data))), moves_figure(data),
         ),
         html.section('Why this number of pieces', choice_figure(c.choice, max(1, len(c.pieces)))),

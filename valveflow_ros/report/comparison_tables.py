@@ -17,6 +17,7 @@ from valveflow_ros.records import FloatArray, SegmentKind
 from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
 from valveflow_ros.report.figure import csv_text
+from valveflow_ros.report.page import Cells
 from valveflow_ros.segments.window import WindowContents
 
 # In the order of the tables; the names in files, and those for people.
@@ -82,18 +83,18 @@ def _pieces(data: Compared) -> Iterator[tuple[str, int, Line]]:
                 yield method, j, line
 
 
-def parameters_table(data: Compared) -> str:
-    """Return Table II: slopes, intercepts and pieces of the curves that have them."""
+def parameters_cells(data: Compared) -> Cells:
+    """Return the cells of Table II: slopes, intercepts and pieces of the curves."""
     rows = [
         [
-            '' if j else html.text(LABELS[method]), str(j + 1), say.plain(float(line.slopes[j])),
+            '' if j else LABELS[method], str(j + 1), say.plain(float(line.slopes[j])),
             say.decimals(float(line.intercepts[j]), 2),
             say.span(line.knots[j], line.knots[j + 1], 1),
         ]
         for method, j, line in _pieces(data)
     ]  # fmt: skip
     head = ['method', 'piece', 'slope (MW per unit of u)', 'intercept (MW)', 'u']
-    return html.table(head, rows, caption="As in the paper's Table II.")
+    return head, rows
 
 
 def errors_table(data: Compared) -> str:
@@ -133,14 +134,14 @@ def errors_table(data: Compared) -> str:
     )
 
 
-def totals_table(data: Compared) -> str:
-    """Return the mean squared errors over all segments, and the tests for zero mean."""
+def totals_cells(data: Compared) -> Cells:
+    """Return the cells of the mean squared errors, and of the tests for zero mean."""
     j, all_rows = data.result.judgement, data.result.all_rows
     rows = []
     for name in data.predictions:
         bias = j.bias(name)
         rows.append([
-            html.text(PREDICTIONS[name]),
+            PREDICTIONS[name],
             *(mse_cell(j.mse(name, k)) for k in (None, SegmentKind.STEADY, SegmentKind.SLOPE)),
             mse_cell(all_rows.get(name, math.nan)),
             f'{say.decimals(bias.mean, 3)} ({say.p_value(bias.p_value)})'
@@ -152,7 +153,7 @@ def totals_table(data: Compared) -> str:
         'mean difference (MW)', 'zero stands, each sample counted',
         'zero stands, correlation counted',
     ]  # fmt: skip
-    return html.table(head, rows, caption='Mean squared errors on the test data.')
+    return head, rows
 
 
 def pairs_table(pairs: Sequence[Pair]) -> str:

@@ -15,11 +15,11 @@ from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import (
     answer_words,
-    breakpoints_table,
+    breakpoints_cells,
     choice_figure,
     confidence_table,
+    dynamics_cells,
     dynamics_figure,
-    dynamics_table,
     gain_table,
     pieces_table,
     temperature_words,
@@ -64,7 +64,7 @@ def identification_page(data: Identified) -> Page:
         html.section(
             'The answer', html.notice(html.text(data.mixture)) if data.mixture else None,
             answer_words(data), gain_table(data), curve_figure(data), opening_figure(data),
-            pieces_table(data), breakpoints_table(data.shown),
+            pieces_table(data), html.table(*breakpoints_cells(data.shown)),
         ),
         shift_section(data),
         *history_sections(data.history),
@@ -102,7 +102,8 @@ def _dynamics(c: Characteristic) -> Section:
     if not c.dynamics:
         none = 'Time constants and delays were not estimated for this curve.'
         return html.section(title, html.paragraph(none))
-    return html.section(title, dynamics_table(c.dynamics), dynamics_figure(c.dynamics))
+    table = html.table(*dynamics_cells(c.dynamics))
+    return html.section(title, table, dynamics_figure(c.dynamics))
 
 
 def _read(data: Identified) -> Iterator[str]:

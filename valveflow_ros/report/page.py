@@ -56,6 +56,8 @@ def packed_plotly() -> str:
     return base64.b64encode(gzip.compress(script, 9, mtime=0)).decode()
 
 
+Cells = tuple[list[str], list[list[str]]]  # head and rows of a table
+
 # A cell with more characters may be wrapped on a phone, and with still more everywhere.
 _NUMBER, _SENTENCE = 16, 34
 _WORDS = ' class="words"'
@@ -173,13 +175,18 @@ def table(
     caption: str = '',
     sentences: bool = False,
 ) -> str:
-    """Return a table of cells given as HTML; with sentences it is treated as one of many columns.
+    """Return a table of cells given as HTML; empty without rows.
 
+    With sentences it is treated as one of many columns. A power such as ^(9/8) in the head is set
+    as a superscript.
     On a phone a table with many columns shows each row as a list; therefore each cell has the
     name of its column as an attribute.
     """
+    if not rows:
+        return ''
     # Attributes cannot contain HTML.
-    labels = [without_tags(h).replace('&shy;', '').replace('"', '&quot;') for h in head]
+    labels = [without_tags(h).replace('"', '&quot;') for h in head]
+    head = [re.sub(r'\^\(?([\w./]+)\)?', r'<sup>\1</sup>', h) for h in head]
     many = sentences or len(head) > _MANY
 
     def cell(k: int, html: str) -> str:

@@ -19,7 +19,7 @@ from valveflow_ros.report import page as html
 from valveflow_ros.report import words as say
 from valveflow_ros.report.answer import misfit_words
 from valveflow_ros.report.figure import DAY_HOUR, Figure, Spec
-from valveflow_ros.report.page import Page
+from valveflow_ros.report.page import Cells, Page
 from valveflow_ros.segments.window import WindowContents
 
 LABELS = {
@@ -139,10 +139,10 @@ def validation_page(data: Validated) -> Page:
             *((html.notice if flag and 'beyond the ends' in s else html.paragraph)(html.text(s))
               for s in rest),
             html.notice(html.text(data.held)) if data.held else None, input_figure(v),
-            pieces_table(v),
+            html.table(*pieces_cells(v)),
         ),
         html.section('When it differs', time_figure(v)),
-        html.section('Predictions', totals_table(v), segments_table(v)),
+        html.section('Predictions', html.table(*totals_cells(v)), segments_table(v)),
     ]  # fmt: skip
     if data.notes:
         notes = html.bullets(map(html.text, data.notes))
@@ -208,8 +208,8 @@ def time_figure(v: Validation) -> Figure:
     return Figure('by-time', caption, 'Mean difference over time.', traces, layout, 340)
 
 
-def pieces_table(v: Validation) -> str:
-    """Return the mean difference overall and on each piece."""
+def pieces_cells(v: Validation) -> Cells:
+    """Return head and cells of the mean difference overall and on each piece."""
     rows = [
         [
             f'piece {k}' if k else 'all', say.span(check.u_from, check.u_to), str(check.segments),
@@ -220,23 +220,23 @@ def pieces_table(v: Validation) -> str:
         for k, check in enumerate((v.overall, *v.pieces))
     ]  # fmt: skip
     head = [
-        '', f'u ({say.input_unit(v.characteristic.pressure_exponent)})', 'segments', _DIFFERENCE,
-        '95 % (MW)', 'independent segments',
+        '', f'u ({say.input_unit_plain(v.characteristic.pressure_exponent)})', 'segments',
+        _DIFFERENCE, '95 % (MW)', 'independent segments',
     ]  # fmt: skip
-    return html.table(head, rows)
+    return head, rows
 
 
-def totals_table(v: Validation) -> str:
-    """Return mean squared errors by kind of segment."""
+def totals_cells(v: Validation) -> Cells:
+    """Return head and cells of the mean squared errors by kind of segment."""
     j, kinds = v.judgement, (None, SegmentKind.STEADY, SegmentKind.SLOPE)
     rows = [
         [
-            html.text(LABELS[name]),
+            LABELS[name],
             *(say.plain(j.mse(name, k)) if j.kinds(k) else '–' for k in kinds),
         ]
         for name in v.predictions
     ]
-    return html.table(['prediction', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows)
+    return ['prediction', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows
 
 
 def segments_table(v: Validation, most: int = 40) -> str:

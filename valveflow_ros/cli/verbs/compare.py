@@ -6,12 +6,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from valveflow_ros.cli import command
-
-if TYPE_CHECKING:
-    from valveflow_ros.report.comparison_tables import Compared
 
 USAGE = 'LOG -o DIR [options]'
 DESCRIPTION = """\
@@ -50,6 +46,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     from valveflow_ros.interface.compare import compare
     from valveflow_ros.interface.logs import open_log
     from valveflow_ros.report.comparison import data_words, finding_words
+    from valveflow_ros.report.comparison_tables import parameters_cells, totals_cells
 
     def other_days() -> object:
         return open_log(options.test, command.mapping_of(options), progress=console)
@@ -60,49 +57,11 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     )  # fmt: skip
     console(0.95, 'writing the report')
     data = found.data
-    text = command.lines(data_words(data), *finding_words(data), _parameters(data), _errors(data))
+    head, rows = totals_cells(data)
+    text = command.lines(
+        data_words(data), *finding_words(data), command.table(*parameters_cells(data)),
+        command.table(head[:5], [row[:5] for row in rows]),
+    )  # fmt: skip
     # The segments are only written to the file.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
     return command.write_results(found, options, text, brief)
-
-
-def _parameters(data: Compared) -> str:
-    from valveflow_ros.report.comparison_tables import LABELS, METHODS
-    from valveflow_ros.report.words import decimals, input_unit_plain, plain
-
-    rows = []
-    for method in METHODS:
-        line = data.result.lines.get(method)
-        for j in range(0 if line is None else len(line.slopes)):
-            assert line is not None
-            rows.append(
-                [
-                    LABELS[method] if j == 0 else '',
-                    f'{decimals(float(line.knots[j]), 1)} to '
-                    f'{decimals(float(line.knots[j + 1]), 1)}',
-                    plain(float(line.slopes[j])),
-                    decimals(float(line.intercepts[j]), 2),
-                ]
-            )
-    unit = input_unit_plain(data.result.characteristic.pressure_exponent)
-    return command.columns(rows, ['curve', f'u ({unit})', 'slope (MW per u)', 'intercept (MW)'])
-
-
-def _errors(data: Compared) -> str:
-    from valveflow_ros.records import SegmentKind
-    from valveflow_ros.report.comparison_tables import PREDICTIONS, mse_cell
-
-    r = data.result
-    rows = [
-        [
-            PREDICTIONS[name],
-            *(
-                mse_cell(r.judgement.mse(name, k)) if r.judgement.kinds(k) else '–'
-                for k in (None, SegmentKind.STEADY, SegmentKind.SLOPE)
-            ),
-            mse_cell(r.all_rows[name]) if name in r.all_rows else '–',
-        ]
-        for name in data.predictions
-    ]
-    head = ['mean squared error (MW^2)', 'segments', 'steady', 'slope', 'all rows']
-    return command.columns(rows, head)

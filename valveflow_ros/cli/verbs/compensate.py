@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from valveflow_ros.cli.command import Console, VerbResult, add_file, add_output, columns, lines
+from valveflow_ros.cli.command import Console, VerbResult, add_file, add_output, lines, table
 from valveflow_ros.errors import DataError, UsageError
 from valveflow_ros.report.terminal.text import number, whole
 
@@ -298,7 +298,7 @@ def _pieces(made: Compensation, pressures: Sequence[float]) -> str:
         ])  # fmt: skip
     head = ['piece', 'power (MW)', 'u', 'u per MW']
     head += [f'opening at {p:g} MPa (%)' for p in pressures]
-    return columns(rows, [*head, 'of use'])
+    return table([*head, 'of use'], rows)
 
 
 def _data(

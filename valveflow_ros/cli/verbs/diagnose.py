@@ -79,7 +79,7 @@ def _text(found: DiagnosisResult) -> str:
     return command.lines(
         f'{found.data.source}: {verdict}{d.sentence}',
         *(advice(c.name, c.meaning, c.to_do) for c in d.causes),
-        command.table(rows, ['cause', 'parameter', 'value', '95 % interval']),
+        command.table(['cause', 'parameter', 'value', '95 % interval'], rows),
         *(f'What would tell them apart: {e}' for e in d.experiments),
         'Error (RMSE) on blocks of time that nothing was fitted to: simulation '
         f'{level(d.rmse_simulation, 3)} MW, extended model {level(d.rmse_extended, 3)} MW. '

@@ -79,7 +79,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     text = command.lines(
         f'{counted(len(found.stories), "unit")}: {counted(found.anew, "log")} done now, '
         f'{found.unchanged} unchanged, {found.failed} without a result.',
-        command.table(rows, head) or none,
+        command.table(head, rows) or none,
         *(f'{s.unit} {log}: {why}' for s in found.stories for log, why in s.failures[:3]),
         f'Wrote {" and ".join(content["files"].values())}.',
     )  # fmt: skip

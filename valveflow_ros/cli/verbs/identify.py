@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from valveflow_ros.cli import command
 
 if TYPE_CHECKING:
-    from valveflow_ros.curve.characteristic import Characteristic
     from valveflow_ros.interface.identify import Identification
     from valveflow_ros.report.identified import Identified
 
@@ -98,8 +97,6 @@ def _text(found: Identified) -> str:
     from valveflow_ros.report.words import counted, held_words, moment, percent, plain
 
     c = found.characteristic
-    loads, gains = answer.gain_cells(found)
-    compared, against = answer.reference_cells(found)
     return command.lines(
         f'{found.source}: {moment(c.source.window_start_ns)} to {moment(c.source.window_end_ns)}',
         answer.doubt(found),
@@ -108,10 +105,10 @@ def _text(found: Identified) -> str:
         answer.pieces_doubt(c),
         answer.range_words(found),
         answer.form_words(found),
-        command.table(gains, loads),
-        _pieces(found),
-        _breakpoints(found.shown),
-        _dynamics(c),
+        command.table(*answer.gain_cells(found)),
+        command.table(*answer.pieces_cells(found)),
+        command.table(*answer.breakpoints_cells(found.shown)),
+        command.table(*answer.dynamics_cells(c.dynamics)),
         'Behind ± stands half of the 95 % interval.',
         f'Found in {counted(c.source.steady, "steady-state segment")} and '
         f'{counted(c.source.slope_response, "slope-response segment")}, '
@@ -121,54 +118,6 @@ def _text(found: Identified) -> str:
         held_words(c.held),
         *c.notes,
         '' if found.shift is None else f'Against the reference: {found.shift.sentence}',
-        command.table(against, compared),
+        command.table(*answer.reference_cells(found)),
         command.rejected_words(found.counts) if rejected(found.counts) else '',
     )
-
-
-def _pieces(found: Identified) -> str:
-    from valveflow_ros.report import words
-
-    c = found.shown
-    rows = [
-        [
-            str(k),
-            words.span(piece.u_from, piece.u_to, 1),
-            words.with_error(piece.slope, piece.slope_stderr),
-            words.with_error(piece.intercept, piece.intercept_stderr),
-            words.count(piece.samples),
-        ]
-        for k, piece in enumerate(c.pieces, 1)
-    ]
-    m = c.pressure_exponent
-    head = ['piece', f'{words.input_name(m)} ({words.input_unit_plain(m)})',
-            f'slope{found.at_pressure} ({words.per_input(m)})', 'intercept (MW)',
-            'samples']  # fmt: skip
-    return command.columns(rows, head)
-
-
-def _breakpoints(c: Characteristic) -> str:
-    from valveflow_ros.report.words import input_name, interval, level
-
-    rows = [
-        [level(piece.u_to, 1), f'{interval(low, high)}', f'{level(float(value), 1)} MW']
-        for piece, (low, high), value in zip(
-            c.pieces[:-1], c.breakpoint_intervals, c.values()[1:-1], strict=True
-        )
-    ]
-    head = [f'breakpoint {input_name(c.pressure_exponent)}', '95 % interval', 'power']
-    return command.table(rows, head)
-
-
-def _dynamics(c: Characteristic) -> str:
-    from valveflow_ros.report.words import span, time_with_error
-
-    rows = [
-        [
-            f'{span(d.power_from, d.power_to)} MW',
-            time_with_error(d.time_constant_s, d.time_constant_stderr_s, 's'),
-            time_with_error(d.delay_s, d.delay_stderr_s, 's'),
-        ]
-        for d in c.dynamics
-    ]
-    return command.table(rows, ['dynamics', 'time constant', 'delay'])

@@ -153,8 +153,8 @@ def _text(
     return command.lines(
         name,
         span,
-        command.table(topics, ['topic', 'type', 'messages', 'rate']),
-        command.table(rows, head),
+        command.table(['topic', 'type', 'messages', 'rate'], topics),
+        command.table(head, rows),
         f'Not in the log: {", ".join(absent)}.' if absent else '',
         command.rejected_words(data['readings'], ranges),
         *(f'{which}: {gaps}' for which, gaps in found.items()),

@@ -66,7 +66,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
         f'{options.table.name}: {found.headline}.',
         content['reason'],
         f'What to do: {found.to_do}' if found.to_do else '',
-        command.table(sizes, ['size', 'value', '95 %', '']),
+        command.table(['size', 'value', '95 %', ''], sizes),
         f'Columns: {taken}; {content["rows"]} rows.',
         f'Wrote {path}.',
     )

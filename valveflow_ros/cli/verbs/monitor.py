@@ -86,10 +86,10 @@ def _text(found: MonitorResult) -> str:
         f'{found.source}: {moment(found.start_ns)} to {moment(found.end_ns)}',
         f'{counted(len(content["curves"]), "curve")}, {counted(len(alarms), "alarm")}, '
         f'{counted(len(content["diagnoses"]), "diagnosis", "diagnoses")}.',
-        command.table(alarms, ['alarm', 'raised', 'cleared', 'state at the end']),
+        command.table(['alarm', 'raised', 'cleared', 'state at the end'], alarms),
         *(sentence for _, sentence in found.standing),
         found.evidence_words,
-        command.table(diagnoses, ['diagnosis', 'verdict', 'causes']),
+        command.table(['diagnosis', 'verdict', 'causes'], diagnoses),
         *found.named,
         *(f'The last diagnosis: {d["sentence"]}' for _, d in found.diagnoses[-1:]),
         *found.advice,

@@ -5,13 +5,9 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from typing import TYPE_CHECKING
 
 from valveflow_ros.cli import command
 from valveflow_ros.report.terminal.text import number
-
-if TYPE_CHECKING:
-    from valveflow_ros.report.validation import Validated
 
 USAGE = 'LOG --model FILE -o DIR [options]'
 DESCRIPTION = """\
@@ -48,7 +44,7 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     """Open the log, find segments, judge, write."""
     log = command.log_of(options, console)
     from valveflow_ros.interface.compare import validate
-    from valveflow_ros.report.validation import verdict_words
+    from valveflow_ros.report.validation import pieces_cells, totals_cells, verdict_words
 
     found = validate(
         log, options.model, against=options.against, tolerance_mw=options.tolerance,
@@ -58,41 +54,8 @@ def run(options: Namespace, console: command.Console) -> command.VerbResult:
     data = found.data
     text = command.lines(
         f'{data.model}, compared with {data.source}:', *verdict_words(data), data.held,
-        _pieces(data), _errors(data),
+        command.table(*pieces_cells(data.result)), command.table(*totals_cells(data.result)),
     )  # fmt: skip
     # The segments are only written to the file.
     brief = {k: v for k, v in found.to_json().items() if k != 'segments'}
     return command.write_results(found, options, text, brief)
-
-
-def _pieces(data: Validated) -> str:
-    from valveflow_ros.report.words import decimals, input_name, input_unit_plain, interval
-
-    v = data.result
-    rows = [
-        [
-            'all' if k == 0 else str(k),
-            f'{decimals(c.u_from, 1)} to {decimals(c.u_to, 1)}',
-            str(c.segments),
-            decimals(c.test.mean, 2),
-            interval(c.low_mw, c.high_mw),
-        ]
-        for k, c in enumerate((v.overall, *v.pieces))
-    ]
-    m = v.characteristic.pressure_exponent
-    head = ['piece', f'{input_name(m)} ({input_unit_plain(m)})', 'segments']
-    return command.columns(rows, [*head, 'measured - predicted (MW)', '95 % (MW)'])
-
-
-def _errors(data: Validated) -> str:
-    from valveflow_ros.records import SegmentKind
-    from valveflow_ros.report.validation import LABELS
-    from valveflow_ros.report.words import plain
-
-    j = data.result.judgement
-    kinds = (None, SegmentKind.STEADY, SegmentKind.SLOPE)
-    rows = [
-        [LABELS[name], *(plain(j.mse(name, k)) if j.kinds(k) else '-' for k in kinds)]
-        for name in data.result.predictions
-    ]
-    return command.columns(rows, ['mean squared error (MW^2)', 'segments', 'steady', 'slope'])
