@@ -60,26 +60,17 @@ _DEPENDS = {
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One row of the table.
-
-    Attributes
-    ----------
-    low, high : float, optional
-        Inclusive range of a number.
-    choices : tuple of str
-        The allowed values of a text; empty means any text.
-    live : bool
-        True if it may be changed while the monitor runs.
-    """
+    """One row of the table."""
 
     name: str
     default: Value
     unit: str
     sentence: str
+    # low, high: inclusive range of a number
     low: float | None = None
     high: float | None = None
-    choices: tuple[str, ...] = ()
-    live: bool = False
+    choices: tuple[str, ...] = ()  # the allowed values of a text; empty means any text
+    live: bool = False  # True if it may be changed while the monitor runs
 
     @property
     def of_state(self) -> bool:

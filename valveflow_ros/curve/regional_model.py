@@ -14,29 +14,21 @@ from valveflow_ros.records import ByteArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class RegionalModel:
-    """Curve F of eq. (2) and G_i of eq. (3).
+    """Curve F of eq. (2) and G_i of eq. (3)."""
 
-    Attributes
-    ----------
-    knots : float64 (J + 1,)
-        Boundaries of the pieces in % MPa^m; the outer pieces extend beyond the outer ones.
-    left, right : float64 (J,)
-        Flow in MW at the left and right end of each piece.
-    levels : float64 (I - 1,)
-        Flow in MW at the boundaries between regions.
-    time_constants, delays : float64 (I,)
-        Seconds. ``I = 0`` (empty) means that the dynamics are unknown.
-    offset_mw : float or None
-        c of P = p^e F(V) + c; None if P = F(V p^m). With an offset, the values of pieces are in
-        MW / MPa^e, and flows are in MW.
-    """
-
+    # float64 (J + 1,): Boundaries of the pieces in % MPa^m; the outer pieces extend beyond the
+    # outer ones.
     knots: FloatArray
+    # left, right: float64 (J,), flow in MW at the left and right end of each piece
     left: FloatArray
     right: FloatArray
-    levels: FloatArray
+    levels: FloatArray  # float64 (I - 1,), flow in MW at the boundaries between regions
+    # time_constants, delays: float64 (I,), seconds. ``I = 0`` (empty) means that the dynamics are
+    # unknown.
     time_constants: FloatArray
     delays: FloatArray
+    # c of P = p^e F(V) + c; None if P = F(V p^m). With an offset, the values of pieces are in MW /
+    # MPa^e, and flows are in MW.
     offset_mw: float | None = None
 
     @property

@@ -63,22 +63,13 @@ _PROFILE_MEANS, _PROFILE_PIECES = 1500, 6
 
 @dataclass(frozen=True, slots=True)
 class FoundForm:
-    """The form that the data require.
-
-    Attributes
-    ----------
-    form : StaticForm
-    offset_mw : float
-        Initial c of a fit; 0 for a form without c.
-    evidence : FormEvidence or None
-        None if the data are too few to compare a given form with the other.
-    exponent_held : bool
-        A fit should not change the exponent: it is given, or the data do not determine it.
-    """
+    """The form that the data require."""
 
     form: StaticForm
-    offset_mw: float
+    offset_mw: float  # initial c of a fit; 0 for a form without c
+    # None if the data are too few to compare a given form with the other.
     evidence: FormEvidence | None
+    # A fit should not change the exponent: it is given, or the data do not determine it.
     exponent_held: bool
 
 
@@ -207,17 +198,10 @@ def _at_end(fit: _Fit, within: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """The error of a curve that repeats at the same openings and pressures.
+    """The error of a curve that repeats at the same openings and pressures."""
 
-    Attributes
-    ----------
-    rms_mw : float
-        Root mean square over the visited range, without noise that does not repeat.
-    worst : tuple of float
-        Opening in %, pressure in MPa, and measured minus predicted power there in MW.
-    """
-
-    rms_mw: float
+    rms_mw: float  # root mean square over the visited range, without noise that does not repeat
+    # Opening in %, pressure in MPa, and measured minus predicted power there in MW.
     worst: tuple[float, float, float]
 
 

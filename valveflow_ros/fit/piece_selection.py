@@ -42,17 +42,11 @@ _BLOCKS = 60
 
 @dataclass(frozen=True, slots=True)
 class ChosenPieces:
-    """A model with its number of pieces chosen.
-
-    Attributes
-    ----------
-    model : RegionalModel
-    worth : dict
-        The gain in log-likelihood by the J-th piece, for each J from 2 on, with the robust
-        variance; the largest J is one more than the model's pieces if that was tried.
-    """
+    """A model with its number of pieces chosen."""
 
     model: RegionalModel
+    # The gain in log-likelihood by the J-th piece, for each J from 2 on, with the robust variance;
+    # the largest J is one more than the model's pieces if that was tried.
     worth: dict[int, float]
 
 

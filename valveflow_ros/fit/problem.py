@@ -39,31 +39,19 @@ _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4, 0.2, 0.1, 0.05)
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """All rows of the window, in the form that the model needs.
+    """All rows of the window, in the form that the model needs."""
 
-    Attributes
-    ----------
-    u, power_mw : float64 (n,)
-    usable : uint8 (n,)
-        0 if a row has no data; a gap restarts the filters.
-    step_s : float
-    settle_s : float
-        Rows within this time after a gap are not scored.
-    group : int
-        Rows averaged before scoring.
-    scale : float64 (n,), optional
-        p^e of P = p^e F(u) + c; without it P = F(u).
-    pressure_mpa : float64 (n,), optional
-        p, 1 where a row has no data; only needed to fit the exponent of the pressure.
-    """
-
+    # u, power_mw: float64 (n,)
     u: FloatArray
     power_mw: FloatArray
-    usable: ByteArray
+    usable: ByteArray  # uint8 (n,), 0 if a row has no data; a gap restarts the filters
     step_s: float
-    settle_s: float
-    group: int
+    settle_s: float  # rows within this time after a gap are not scored
+    group: int  # rows averaged before scoring
+    # float64 (n,), optional: p^e of P = p^e F(u) + c; without it P = F(u).
     scale: FloatArray | None = None
+    # float64 (n,), optional: p, 1 where a row has no data; only needed to fit the exponent of the
+    # pressure.
     pressure_mpa: FloatArray | None = None
 
     @property

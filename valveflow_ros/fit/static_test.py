@@ -52,17 +52,10 @@ _DYNAMIC_T = 4.0  # t value of the last move's effect; above it the rows are not
 
 @dataclass(frozen=True, slots=True)
 class StaticTest:
-    """The result of a static test.
-
-    Attributes
-    ----------
-    characteristic : Characteristic
-    segments : tuple of SpecialSegment
-        One segment for each row that is used.
-    """
+    """The result of a static test."""
 
     characteristic: Characteristic
-    segments: tuple[SpecialSegment, ...]
+    segments: tuple[SpecialSegment, ...]  # one segment for each row that is used
 
 
 def find_static_test(table: SampleTable, settings: Settings) -> StaticTest | None:

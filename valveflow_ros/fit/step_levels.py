@@ -32,31 +32,20 @@ _DUST = 1e-6  # minimum error of a power, as a fraction
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """An opening that was held.
+    """An opening that was held."""
 
-    Attributes
-    ----------
-    first, end : int
-        Rows of its settled part, ``[first, end)``; equal if it has none.
-    held_s : float
-        Time for which it was held, including the transient.
-    opening_percent, pressure_mpa, u, power_mw : float
-        Means over the settled part; without one they are NaN, except the opening.
-    power_error_mw : float
-        Standard error of the mean power; it allows for correlation in time.
-    problem : str
-        Why the level is not used, as the end of a sentence; empty if it is used.
-    """
-
+    # first, end: rows of its settled part, ``[first, end)``; equal if it has none
     first: int
     end: int
-    held_s: float
+    held_s: float  # time for which it was held, including the transient
+    # opening_percent, pressure_mpa, u, power_mw: means over the settled part; without one they are
+    # NaN, except the opening
     opening_percent: float
     pressure_mpa: float
     u: float
     power_mw: float
-    power_error_mw: float
-    problem: str
+    power_error_mw: float  # standard error of the mean power; it allows for correlation in time
+    problem: str  # why the level is not used, as the end of a sentence; empty if it is used
 
     @property
     def samples(self) -> int:

@@ -59,23 +59,15 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class BrokenLine:
-    """The line and its errors.
+    """The line and its errors."""
 
-    Attributes
-    ----------
-    knots, values : float64 (J + 1,)
-    covariance : float64 (J + 1, J + 1)
-        Of the values, with the knots kept fixed.
-    knot_error : float64 (J - 1,)
-        Standard errors of the inner knots; NaN if a level is the knot.
-    cost : dict
-        Weighted sum of squares by number of pieces; empty if each level is a knot.
-    """
-
+    # knots, values: float64 (J + 1,)
     knots: FloatArray
     values: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray  # float64 (J + 1, J + 1), of the values, with the knots kept fixed
+    # float64 (J - 1,): Standard errors of the inner knots; NaN if a level is the knot.
     knot_error: FloatArray
+    # Weighted sum of squares by number of pieces; empty if each level is a knot.
     cost: dict[int, float]
 
 
@@ -235,22 +227,12 @@ _NEAR = 0.005  # of the range of u: closer levels are the same opening
 
 @dataclass(frozen=True, slots=True)
 class StepTest:
-    """The result of a step test.
-
-    Attributes
-    ----------
-    characteristic : Characteristic
-    levels : tuple of Level
-        All levels that were found, in chronological order.
-    segments : tuple of SpecialSegment
-        The settled parts of the levels that are used.
-    pressure_spread_percent : float
-        Central 95 % of the pressure in the settled parts, in % of its mean.
-    """
+    """The result of a step test."""
 
     characteristic: Characteristic
-    levels: tuple[Level, ...]
-    segments: tuple[SpecialSegment, ...]
+    levels: tuple[Level, ...]  # all levels that were found, in chronological order
+    segments: tuple[SpecialSegment, ...]  # the settled parts of the levels that are used
+    # Central 95 % of the pressure in the settled parts, in % of its mean.
     pressure_spread_percent: float
 
 

@@ -18,32 +18,17 @@ from valveflow_ros.signals.static_form import StaticForm
 
 @dataclass(frozen=True, slots=True)
 class FitTask:
-    """All inputs of a fit.
+    """All inputs of a fit."""
 
-    Attributes
-    ----------
-    request_ns : int
-        Time of the last row before the request; it identifies the fit.
-    contents : WindowContents
-    settings : Settings
-    input_noise, power_noise_mw : float
-        The segmenter's noise levels at that moment.
-    held : tuple of HeldCause
-        Causes that were removed from the rows.
-    form : StaticForm, optional
-        The form of the curve; by default it is chosen from the data.
-    known : StaticForm, optional
-        The form that was found from earlier data.
-    """
-
-    request_ns: int
+    request_ns: int  # time of the last row before the request; it identifies the fit
     contents: WindowContents
     settings: Settings
+    # input_noise, power_noise_mw: the segmenter's noise levels at that moment
     input_noise: float
     power_noise_mw: float
-    held: tuple[HeldCause, ...] = ()
-    form: StaticForm | None = None
-    known: StaticForm | None = None
+    held: tuple[HeldCause, ...] = ()  # causes that were removed from the rows
+    form: StaticForm | None = None  # the form of the curve; by default it is chosen from the data
+    known: StaticForm | None = None  # the form that was found from earlier data
 
 
 # Windows that do not determine a curve, with advice in the messages.

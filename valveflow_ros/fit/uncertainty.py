@@ -29,33 +29,20 @@ _EXPONENT_STEP = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Certainty:
-    """Covariance of the estimates.
+    """Covariance of the estimates."""
 
-    Attributes
-    ----------
-    covariance : float64 (P, P)
-        Of the packed parameters. It is 0 for fixed parameters, and NaN for free parameters that
-        are not determined by the data.
-    level_stderr : float64 (I - 1,)
-        Standard errors of the levels between regions, MW.
-    innovation_mw : float
-        sd of the whitened residual.
-    prediction_mw : float
-        Error of the prediction due to the errors of the parameters: root mean square of all rows.
-        NaN if the fit is not the final one.
-    step : float64 (P + 1,), optional
-        Gauss-Newton step of the packed parameters and the exponent of the pressure, without
-        damping, if the exponent is free.
-    exponent_stderr : float
-        Standard error of that exponent.
-    """
-
+    # float64 (P, P): Of the packed parameters. It is 0 for fixed parameters, and NaN for free
+    # parameters that are not determined by the data.
     covariance: FloatArray
-    level_stderr: FloatArray
-    innovation_mw: float
+    level_stderr: FloatArray  # float64 (I - 1,), standard errors of the levels between regions, MW
+    innovation_mw: float  # sd of the whitened residual
+    # Error of the prediction due to the errors of the parameters: root mean square of all rows.
+    # NaN if the fit is not the final one.
     prediction_mw: float
+    # float64 (P + 1,), optional: Gauss-Newton step of the packed parameters and the exponent of
+    # the pressure, without damping, if the exponent is free.
     step: FloatArray | None = None
-    exponent_stderr: float = math.nan
+    exponent_stderr: float = math.nan  # standard error of that exponent
 
 
 def covariance_of(

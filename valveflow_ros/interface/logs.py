@@ -343,20 +343,12 @@ def read_series(source: Any, mapping: LogMapping, log: str, name: str, said: str
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A further column of a log, with its unit, '' if unknown.
-
-    Attributes
-    ----------
-    time_ns : int64 (k,)
-        Not decreasing.
-    values : float64 (k,)
-        Finite.
-    """
+    """A further column of a log, with its unit, '' if unknown."""
 
     column: str
     unit: str
-    time_ns: IntArray
-    values: FloatArray
+    time_ns: IntArray  # int64 (k,), not decreasing
+    values: FloatArray  # float64 (k,), finite
 
     def at(self, time_ns: IntArray) -> FloatArray:
         """Return the values at other times by linear interpolation; NaN in gaps and outside.

@@ -59,26 +59,16 @@ LEARN_SHARE = 2.0 / 3.0
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """A log processed by the engine, and the inputs of a fit.
+    """A log processed by the engine, and the inputs of a fit."""
 
-    Attributes
-    ----------
-    table : SampleTable
-        The rows in the engine's window; if the clock was set back, without the rows before that.
-    rows : int64 (n,)
-        Their indices among all rows of the log.
-    counts : dict
-        ``{topic: {reason: readings}}``.
-    clock_resets : int
-        Number of times the clock was set back.
-    """
-
+    # SampleTable: The rows in the engine's window; if the clock was set back, without the rows
+    # before that.
     table: SampleTable
-    rows: IntArray
+    rows: IntArray  # int64 (n,), their indices among all rows of the log
     segments: tuple[SpecialSegment, ...]
-    counts: dict[str, dict[str, int]]
+    counts: dict[str, dict[str, int]]  # ``{topic: {reason: readings}}``
     task: FitTask
-    clock_resets: int
+    clock_resets: int  # number of times the clock was set back
 
     def fit(self, progress: Callable[[float, str], None] = SILENT) -> Characteristic:
         """Return the curve; raise `DataError` with the reason if the data determine none."""

@@ -35,27 +35,17 @@ _MOST = 0.5  # above this fraction, the unit or the column is wrong
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """A signal whose values are implausible for its unit.
-
-    Attributes
-    ----------
-    impossible : float
-        Fraction of its values that the engine will reject.
-    looks_like : str
-        A unit in which the values are usual, empty if there is none; of several units the one
-        that brings the values nearest to the middle of the usual range. ``also`` has the others.
-    sentence : str
-        The message for the user, without the option that solves the problem.
-    other : bool
-        In the unit that was told, the values are usual for another quantity: it is rather the
-        column that is wrong than the unit.
-    """
+    """A signal whose values are implausible for its unit."""
 
     signal: Signal
-    impossible: float
+    impossible: float  # fraction of its values that the engine will reject
+    # A unit in which the values are usual, empty if there is none; of several units the one that
+    # brings the values nearest to the middle of the usual range. ``also`` has the others.
     looks_like: str
-    sentence: str
+    sentence: str  # the message for the user, without the option that solves the problem
     also: tuple[str, ...] = ()
+    # In the unit that was told, the values are usual for another quantity: it is rather the column
+    # that is wrong than the unit.
     other: bool = False
 
     def advice(self, theirs: str) -> str:

@@ -45,7 +45,7 @@ Messages = Callable[[Collection[str] | None], Iterator[LoggedMessage]]
 
 @dataclass(frozen=True, slots=True)
 class LogContents:
-    """Contents of a log.
+    """Contents of a log."""
 
     Attributes
     ----------
@@ -83,18 +83,26 @@ class LogContents:
 
     path: str
     readings: Readings
+    # int64 (n,): Time at which each reading was received; for tables the time of the reading.
     log_time_ns: IntArray
-    topics: dict[str, TopicInfo] = field(default_factory=dict)
+    topics: dict[str, TopicInfo] = field(default_factory=dict)  # every topic; empty for tables
+    # Which topic or column each signal comes from.
     signals: dict[Signal, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()  # sentences to show to the user
+    attachments: dict[str, bytes] = field(default_factory=dict)  # attached files by name
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # metadata records by name
+    # start_ns, end_ns: first and last log time of any message
     start_ns: int | None = None
     end_ns: int | None = None
-    damaged_chunks: int = 0
+    damaged_chunks: int = 0  # number of places where data were lost
+    # Yields the raw messages of the given topics (None for all) in the order of their log times;
+    # see `iter_messages`. A table has none.
     messages: Messages = lambda topics: iter(())
+    # The unit that the log states for a signal, for example in the head of a column.
     units: dict[Signal, str] = field(default_factory=dict)
+    # Why a column was assigned to a signal, if the names alone did not decide it.
     grounds: dict[Signal, str] = field(default_factory=dict)
+    # Sentences about what was inferred from the data.
     understood: list[str] = field(default_factory=list)
 
     def iter_messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:

@@ -47,21 +47,12 @@ class Priority(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class AlarmChange:
-    """One announced change of the state of an alarm.
-
-    Attributes
-    ----------
-    state, previous : AlarmState
-        The new state and the one before it, whether or not that one was announced. Both are
-        equal if an alarm that has been standing for long is announced again.
-    occurrence : int
-        How many times the condition has begun, whether or not that was announced.
-    first_out : str
-        The standing alarm that was raised first; empty if none stands.
-    """
+    """One announced change of the state of an alarm."""
 
     time_ns: int
     name: str
+    # state, previous: the new state and the one before it, whether or not that one was announced.
+    # Both are equal if an alarm that has been standing for long is announced again.
     state: AlarmState
     previous: AlarmState
     priority: Priority
@@ -69,10 +60,10 @@ class AlarmChange:
     limit: float
     unit: str
     sentence: str
-    occurrence: int
+    occurrence: int  # how many times the condition has begun, whether or not that was announced
     raised_ns: int
     model_id: str
-    first_out: str = ''
+    first_out: str = ''  # the standing alarm that was raised first; empty if none stands
 
     def snapshot(self) -> State:
         """Return the change as plain values."""

@@ -62,14 +62,19 @@ class LinkState:
         Result of reading the history of the last outage.
     """
 
+    # up, since_s: whether the link is up, and the monotonic time of the last change
     up: bool = False
     since_s: float = field(default_factory=time.monotonic)
-    problem: str = ''
+    problem: str = ''  # why it is not up; empty before the first attempt
+    # attempts, losses: attempts to connect since it was up, and number of losses
     attempts: int = 0
     losses: int = 0
+    # lost_messages, republished: messages missing by their sequence numbers, and those received on
+    # request
     lost_messages: int = 0
     republished: int = 0
-    clock_ahead_s: float = math.nan
+    clock_ahead_s: float = math.nan  # server's clock minus this machine's clock; NaN if unknown
+    # Problem with the node of a signal, by signal.
     nodes: dict[int, str] = field(default_factory=dict)
     backfill: str = ''
     overflows: dict[int, int] = field(default_factory=dict)

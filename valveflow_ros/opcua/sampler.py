@@ -44,30 +44,22 @@ class Sample(NamedTuple):
 
 @dataclass(slots=True)
 class Counts:
-    """Counters of one signal.
+    """Counters of one signal."""
 
-    Attributes
-    ----------
-    received, lost : int
-        Changes received, and overflows of the server's queue (each loses at least one change).
-    uncertain, bad : int
-        Changes with this StatusCode.
-    wrong_type, not_finite : int
-        Values that are no number, NaN or infinite; used as bad.
-    future : int
-        Source timestamps more than `AHEAD_NS` ahead; the value is used from its receipt, as
-        uncertain.
-    went_back, without_time : int
-        Source timestamps earlier than the previous one, and missing ones.
-    """
-
+    # received, lost: changes received, and overflows of the server's queue (each loses at least
+    # one change)
     received: int = 0
     lost: int = 0
+    # uncertain, bad: changes with this StatusCode
     uncertain: int = 0
     bad: int = 0
+    # wrong_type, not_finite: values that are no number, NaN or infinite; used as bad
     wrong_type: int = 0
     not_finite: int = 0
+    # Source timestamps more than `AHEAD_NS` ahead; the value is used from its receipt, as
+    # uncertain.
     future: int = 0
+    # went_back, without_time: source timestamps earlier than the previous one, and missing ones
     went_back: int = 0
     without_time: int = 0
 

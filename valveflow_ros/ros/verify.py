@@ -42,25 +42,15 @@ _PATIENCE = 10.0
 
 @dataclass(slots=True)
 class Verification:
-    """Result of a comparison.
+    """Result of a comparison."""
 
-    Attributes
-    ----------
-    inputs, rows : int
-        Number of input messages, and of rows of the sample table made of them.
-    compared : dict of str to int
-        Number of messages that were equal byte for byte, by output.
-    difference : str
-        The first difference as a sentence; empty if there was none.
-    warnings : tuple of str
-        Warnings of the reader about the file.
-    """
-
+    # inputs, rows: number of input messages, and of rows of the sample table made of them
     inputs: int = 0
     rows: int = 0
+    # Number of messages that were equal byte for byte, by output.
     compared: dict[str, int] = field(default_factory=dict)
-    difference: str = ''
-    warnings: tuple[str, ...] = ()
+    difference: str = ''  # the first difference as a sentence; empty if there was none
+    warnings: tuple[str, ...] = ()  # warnings of the reader about the file
 
     @property
     def identical(self) -> bool:

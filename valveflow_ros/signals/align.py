@@ -343,17 +343,10 @@ def _align(
 
 @dataclass(frozen=True, slots=True)
 class Aligned:
-    """The result of one call: rows, and the resets of the clock among them.
+    """The result of one call: rows, and the resets of the clock among them."""
 
-    Attributes
-    ----------
-    table : SampleTable
-        The closed rows.
-    resets : int64 (k,)
-        Row numbers within ``table`` before which the clock was set back.
-    """
-
-    table: SampleTable
+    table: SampleTable  # the closed rows
+    # int64 (k,): Row numbers within ``table`` before which the clock was set back.
     resets: IntArray
 
 

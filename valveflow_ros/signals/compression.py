@@ -46,39 +46,22 @@ _ROUND_S = (1, 2, 5, 10, 15, 20, 30, 60)
 
 @dataclass(frozen=True, slots=True)
 class Updates:
-    """How one signal of a compressed log is stored.
+    """How one signal of a compressed log is stored."""
 
-    Attributes
-    ----------
-    interval_s : float
-        Median time between values.
-    dead_band : float
-        Smallest change that is stored, in the engine's unit.
-    """
-
-    interval_s: float
-    dead_band: float
+    interval_s: float  # median time between values
+    dead_band: float  # smallest change that is stored, in the engine's unit
 
 
 @dataclass(frozen=True, slots=True)
 class Compression:
-    """A log that was compressed by exception.
+    """A log that was compressed by exception."""
 
-    Attributes
-    ----------
-    updates : dict of Signal to Updates
-        The signals in which compression was found.
-    longest_s : float
-        Longest regular time between values; after a longer time the value is missing.
-    step_s : float
-        Time between rows: that of the log if it repeats its values, else a suitable one.
-    own_times : bool
-        True if values have their own times; otherwise the rows of the log repeat them.
-    """
-
-    updates: dict[Signal, Updates]
+    updates: dict[Signal, Updates]  # the signals in which compression was found
+    # Longest regular time between values; after a longer time the value is missing.
     longest_s: float
+    # Time between rows: that of the log if it repeats its values, else a suitable one.
     step_s: float
+    # True if values have their own times; otherwise the rows of the log repeat them.
     own_times: bool
 
     @property

@@ -48,18 +48,10 @@ def exponents_near(exponent: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class StaticForm:
-    """The argument and the factor of the curve.
+    """The argument and the factor of the curve."""
 
-    Attributes
-    ----------
-    axis : str
-        'integrated_input': P = F(V p^m). 'opening': P = p^m F(V) + c.
-    exponent : float
-        m.
-    """
-
-    axis: str = INTEGRATED_INPUT
-    exponent: float = PAPER_EXPONENT
+    axis: str = INTEGRATED_INPUT  # 'integrated_input': P = F(V p^m). 'opening': P = p^m F(V) + c.
+    exponent: float = PAPER_EXPONENT  # m
 
     @property
     def scaled(self) -> bool:

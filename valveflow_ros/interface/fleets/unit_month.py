@@ -46,24 +46,15 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class FleetTask:
-    """The task that a worker receives.
-
-    Attributes
-    ----------
-    folder : Path
-        The folder of results, which all workers must see.
-    before, first : str
-        File names in ``folder`` of the previous log's curve and of the unit's first curve,
-        empty if there is none.
-    version : str
-        Version of the package that created the task.
-    """
+    """The task that a worker receives."""
 
     of: UnitLog
-    folder: Path
+    folder: Path  # the folder of results, which all workers must see
+    # before, first: file names in ``folder`` of the previous log's curve and of the unit's first
+    # curve, empty if there is none
     before: str
     first: str
-    version: str = __version__
+    version: str = __version__  # version of the package that created the task
 
     @property
     def place(self) -> Path:

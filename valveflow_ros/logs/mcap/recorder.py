@@ -46,33 +46,22 @@ class RecorderState(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class RecorderSettings:
-    """Settings of a recorder; every time is in seconds.
+    """Settings of a recorder; every time is in seconds."""
 
-    Attributes
-    ----------
-    queue_limit : int
-        Maximum number of messages not yet on disk; further messages are dropped and counted.
-    flush_period_s : float
-        Maximum time of messages that a killed process loses.
-    sync_period_s : float
-        Maximum time of messages that a power cut loses; 0 leaves it to the operating system.
-    rotate_s, rotate_bytes : float, int
-        A new split is begun after this time or size.
-    free_floor_bytes : int
-        Nothing is written if the disk has less free space than this.
-    keep_files : int or None
-        Number of finished splits to keep; older ones are deleted. None keeps all.
-    retry_s, retry_max_s : float
-        First and maximum wait after a failure; the wait doubles with every failure.
-    """
-
+    # Maximum number of messages not yet on disk; further messages are dropped and counted.
     queue_limit: int = 200_000
-    flush_period_s: float = 0.5
+    flush_period_s: float = 0.5  # maximum time of messages that a killed process loses
+    # Maximum time of messages that a power cut loses; 0 leaves it to the operating system.
     sync_period_s: float = 5.0
+    # rotate_s, rotate_bytes: a new split is begun after this time or size
     rotate_s: float = 3600.0
     rotate_bytes: int = 256 * MIB
+    # Nothing is written if the disk has less free space than this.
     free_floor_bytes: int = 500 * MIB
+    # Number of finished splits to keep; older ones are deleted. None keeps all.
     keep_files: int | None = None
+    # retry_s, retry_max_s: first and maximum wait after a failure; the wait doubles with every
+    # failure
     retry_s: float = 1.0
     retry_max_s: float = 10.0
 

@@ -81,32 +81,18 @@ DECIMALS = ('point', 'comma')
 
 @dataclass(frozen=True, slots=True)
 class TableOptions:
-    """Options for reading a table; an empty option is inferred, or the table is refused.
+    """Options for reading a table; an empty option is inferred, or the table is refused."""
 
-    Attributes
-    ----------
-    time_zone : str
-        Zone of times without a zone: a name of the tz database (``Europe/Berlin``)
-        or an offset (``+01:00``). Empty: the zone in the column name, otherwise UTC.
-    date_order : str
-        ``dmy``, ``mdy`` or ``ymd``, for dates such as 01/02/2026.
-    decimal : str
-        ``point`` or ``comma``.
-    sheet : str
-        Sheet of a workbook; by default the only sheet with a table.
-    max_unpacked : str
-        Maximum unpacked megabytes of a workbook or of the needed columns of a Parquet file.
-        Empty: 64, or 200 times the file size if that is more, up to a fixed limit.
-    period : str
-        Time between two rows of a table without times: ``60s``, ``1min``, ``60``.
-    """
-
+    # Zone of times without a zone: a name of the tz database (``Europe/Berlin``) or an offset
+    # (``+01:00``). Empty: the zone in the column name, otherwise UTC.
     time_zone: str = ''
-    date_order: str = ''
-    decimal: str = ''
-    sheet: str = ''
+    date_order: str = ''  # ``dmy``, ``mdy`` or ``ymd``, for dates such as 01/02/2026
+    decimal: str = ''  # ``point`` or ``comma``
+    sheet: str = ''  # sheet of a workbook; by default the only sheet with a table
+    # Maximum unpacked megabytes of a workbook or of the needed columns of a Parquet file. Empty:
+    # 64, or 200 times the file size if that is more, up to a fixed limit.
     max_unpacked: str = ''
-    period: str = ''
+    period: str = ''  # time between two rows of a table without times: ``60s``, ``1min``, ``60``
 
     def __post_init__(self) -> None:
         if self.date_order not in ('', *DATE_ORDERS):

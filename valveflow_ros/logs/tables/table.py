@@ -37,7 +37,7 @@ _BLOCK_ROWS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class RawTable:
-    """A table as in its file, except that its rows are in time order.
+    """A table as in its file, except that its rows are in time order."""
 
     Attributes
     ----------
@@ -69,15 +69,23 @@ class RawTable:
 
     path: str
     time_ns: IntArray
+    # dict[str, float64 (n,)]: By contract column name, in the units of the file; NaN for cells
+    # without a number.
     columns: dict[str, FloatArray]
-    names: dict[str, str]
+    names: dict[str, str]  # name of each column in the file
+    # dict[str, uint8 (n,)]: A `Quality` per value, for columns that have a quality column in the
+    # file.
     quality: dict[str, ByteArray]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # sentences about what was inferred or left out
+    # Number of cells that are not empty and hold no number, by contract column name.
     bad_cells: dict[str, int]
-    bad_times: int = 0
+    bad_times: int = 0  # number of rows left out because their time cannot be read
+    # The unit in the file, by contract column name.
     units: dict[str, str] = field(default_factory=dict)
+    # Why a column was assigned to a signal, if its name was not exact.
     grounds: dict[str, str] = field(default_factory=dict)
-    ignored: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()  # columns (in a long table: tags) that were not used
+    # dict[str, bool (n,)]: For a long table: the rows that have a value of this signal.
     present: dict[str, BoolArray] = field(default_factory=dict)
 
     def readings(self) -> Readings:

@@ -86,30 +86,21 @@ class TopicStatistics:
     """Statistics of one topic: rate, time of the last message, lost messages.
 
     Times are monotonic, in s.
-
-    Attributes
-    ----------
-    received : int
-        Messages received.
-    lost : int
-        Messages that were sent but not delivered, from gaps in the publisher's
-        sequence numbers; not counted while there is more than one publisher.
-    missed_at_start : int
-        Messages sent before the first one received; usually before the subscription.
-    irregular : int
-        Sequence numbers that decreased: a publisher was restarted, or there are two.
-    malformed, without_time : int
-        Messages that were recorded but not used.
-    waiting, before_clock : int
-        Messages that wait for the first /clock message, and those sent before it.
     """
 
-    received: int = 0
+    received: int = 0  # messages received
+    # Messages that were sent but not delivered, from gaps in the publisher's sequence numbers; not
+    # counted while there is more than one publisher.
     lost: int = 0
+    # Messages sent before the first one received; usually before the subscription.
     missed_at_start: int = 0
+    # Sequence numbers that decreased: a publisher was restarted, or there are two.
     irregular: int = 0
+    # malformed, without_time: messages that were recorded but not used
     malformed: int = 0
     without_time: int = 0
+    # waiting, before_clock: messages that wait for the first /clock message, and those sent before
+    # it
     waiting: int = 0
     before_clock: int = 0
     last_s: float | None = None
