@@ -271,48 +271,32 @@ _LONG_SHARE = 0.75  # and with so much of the rows: gaps cost means
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """The result of a refinement.
-
-    Attributes
-    ----------
-    model : RegionalModel
-    covariance : float64 (P, P)
-        Of the packed parameters; block scores allow for correlation that the AR model leaves.
-    level_stderr : float64 (I - 1,)
-        Of the levels between regions, MW.
-    free : bool (P,)
-        True for the free packed parameters; jumps not supported by the data are not free.
-    ar : float64 (k,)
-        Of the residual of the last fit, whose rows are means over 2 s (or single rows).
-    innovation_mw : float
-        sd of that residual after whitening.
-    prediction_mw : float
-        Error of the prediction due to the errors of the parameters, root mean square.
-    residual_mw : float64 (m,), weight : uint8 (m,)
-        Residual of the means and whether it was scored.
-    row_sd_mw : float
-        sd of the residual of single rows.
-    confidence : dict
-        Probability of each number of pieces; empty when it was given.
-    long_s : float
-        Length of the means to which the curve was fitted, 0 if the last fit was to all rows.
-    exponent_moved, exponent_stderr : float
-        Change of the exponent of the pressure from its start, and its standard error, NaN if it
-        was not free.
-    """
+    """The result of a refinement."""
 
     model: RegionalModel
+    # float64 (P, P): Of the packed parameters; block scores allow for correlation that the AR
+    # model leaves.
     covariance: FloatArray
-    level_stderr: FloatArray
+    level_stderr: FloatArray  # float64 (I - 1,), of the levels between regions, MW
+    # bool (P,): True for the free packed parameters; jumps not supported by the data are not free.
     free: BoolArray
+    # float64 (k,): Of the residual of the last fit, whose rows are means over 2 s (or single
+    # rows).
     ar: FloatArray
-    innovation_mw: float
+    innovation_mw: float  # sd of that residual after whitening
+    # Error of the prediction due to the errors of the parameters, root mean square.
     prediction_mw: float
+    # residual_mw, weight: float64 (m,), uint8 (m,), residual of the means and whether it was
+    # scored
     residual_mw: FloatArray
     weight: ByteArray
-    row_sd_mw: float
+    row_sd_mw: float  # sd of the residual of single rows
+    # Probability of each number of pieces; empty when it was given.
     confidence: dict[int, float] = field(default_factory=dict)
+    # Length of the means to which the curve was fitted, 0 if the last fit was to all rows.
     long_s: float = 0.0
+    # exponent_moved, exponent_stderr: change of the exponent of the pressure from its start, and
+    # its standard error, NaN if it was not free
     exponent_moved: float = 0.0
     exponent_stderr: float = math.nan
 

@@ -71,48 +71,32 @@ class RecorderStatus:
     """State and counters of a recorder.
 
     Always ``received == written + queued + lost + removed + sum of dropped``.
-
-    Attributes
-    ----------
-    state, reason
-        State of the recorder, and why it is not recording; empty if it is.
-    file : str
-        Name of the current split on disk; empty if none.
-    received : int
-        Messages passed to the recorder.
-    written, queued : int
-        Of these, messages in complete chunks of existing files, and that wait to be written.
-    lost : int
-        Of these, messages that waited when the recorder had to stop, or in files that another
-        program removed or changed while they were written, or damaged afterwards.
-    loss : str
-        A sentence about the last loss from a file; empty if there was none.
-    removed : int
-        Of these, messages in finished files deleted since, by ``keep_files`` or another program.
-    dropped : dict[str, int]
-        Of these, messages refused because too many were waiting or the recorder was closed.
-    files_finished, bytes_written : int
-        Splits finished and bytes written since the start.
-    recovered : tuple of RecoveryReport
-        Unfinished files of an earlier recorder that were recovered at the start.
-    stalled_s : float
-        Time since the thread began its current step; 0 while it waits for work. It stays small
-        if the disk returns errors, and grows if the disk does not respond.
     """
 
+    # state, reason: state of the recorder, and why it is not recording; empty if it is
     state: RecorderState
     reason: str = ''
-    file: str = ''
-    received: int = 0
+    file: str = ''  # name of the current split on disk; empty if none
+    received: int = 0  # messages passed to the recorder
+    # written, queued: of these, messages in complete chunks of existing files, and that wait to be
+    # written
     written: int = 0
     queued: int = 0
+    # Of these, messages that waited when the recorder had to stop, or in files that another
+    # program removed or changed while they were written, or damaged afterwards.
     lost: int = 0
-    loss: str = ''
+    loss: str = ''  # a sentence about the last loss from a file; empty if there was none
+    # Of these, messages in finished files deleted since, by ``keep_files`` or another program.
     removed: int = 0
+    # Of these, messages refused because too many were waiting or the recorder was closed.
     dropped: dict[str, int] = field(default_factory=dict)
+    # files_finished, bytes_written: splits finished and bytes written since the start
     files_finished: int = 0
     bytes_written: int = 0
+    # Unfinished files of an earlier recorder that were recovered at the start.
     recovered: tuple[RecoveryReport, ...] = ()
+    # Time since the thread began its current step; 0 while it waits for work. It stays small if
+    # the disk returns errors, and grows if the disk does not respond.
     stalled_s: float = 0.0
 
 
