@@ -92,15 +92,6 @@ class AlarmStateMachine(Memory):
     There are three layers: the condition with its acknowledgement, suppression while the alarm
     cannot be judged, and shelving. The topmost layer determines the visible state. The lower ones
     are still updated, so that nothing is lost when an upper one ends.
-
-    Attributes
-    ----------
-    active : bool
-        True if the condition holds.
-    occurrence, raised_ns : int
-        How many times the condition has begun, and when it last did; 0 if never.
-    shelved_until_ns : int or None
-        Time when the shelving ends automatically; None if it is not shelved.
     """
 
     REMEMBERED: ClassVar[tuple[str, ...]] = (
@@ -108,9 +99,12 @@ class AlarmStateMachine(Memory):
     )  # fmt: skip
 
     def __init__(self) -> None:
-        self.active = False
+        self.active = False  # True if the condition holds
+        # occurrence, raised_ns: how many times the condition has begun, and when it last did; 0 if
+        # never
         self.occurrence = 0
         self.raised_ns = 0
+        # Time when the shelving ends automatically; None if it is not shelved.
         self.shelved_until_ns: int | None = None
         self.suppressed = False
         self._below = AlarmState.NORMAL
@@ -177,20 +171,13 @@ class FloodLimit(Memory):
 
     The time is that of the samples. The first one always passes: only recent announcements can
     hold another one back.
-
-    Attributes
-    ----------
-    most : int
-        Maximum number of announcements within ten minutes.
-    held : int
-        Number of announcements held back since the last one that passed.
     """
 
     REMEMBERED = ('held', '_times_ns')
 
     def __init__(self) -> None:
-        self.most = 1
-        self.held = 0
+        self.most = 1  # maximum number of announcements within ten minutes
+        self.held = 0  # number of announcements held back since the last one that passed
         self._times_ns: list[int] = []
 
     @property
@@ -238,11 +225,6 @@ class Alarm(AlarmStateMachine, ABC):
     ----------
     settings : Settings
         Latch, shelving time, flood limit.
-
-    Attributes
-    ----------
-    last : AlarmChange or None
-        The last announcement.
     """
 
     NAME = ''
@@ -259,7 +241,7 @@ class Alarm(AlarmStateMachine, ABC):
         self._waits = False
         self._told_ns = 0
         self._others = 0  # announcements of other alarms since the last one of this alarm
-        self.last: AlarmChange | None = None
+        self.last: AlarmChange | None = None  # the last announcement
         self._beside: Sequence[Alarm] = (self,)
         self.configure(settings)
 

@@ -179,13 +179,6 @@ class ResidualAlarm(Alarm):
     ----------
     settings : Settings
         Delays, dead band, latch, shelving time, flood limit.
-
-    Attributes
-    ----------
-    judged : Judged
-        Time, evidence and shift for the next announcement.
-    onset_ns : int
-        Time when the evidence for the last occurrence began to grow; 0 if none.
     """
 
     NAME = 'residual'
@@ -197,11 +190,13 @@ class ResidualAlarm(Alarm):
     def __init__(self, settings: Settings) -> None:
         self._memory = np.zeros(_PLACES, dtype=np.int64)
         self._span = np.zeros(2)
+        # Time when the evidence for the last occurrence began to grow; 0 if none.
         self.onset_ns = 0
         self._returned_ns: int | None = None
         self._longer = 1  # factor of the return delay
         # Difference from the curve, and valve opening, when the alarm was raised.
         self._left_mw, self._opening_percent = 0.0, math.nan
+        # Time, evidence and shift for the next announcement.
         self.judged = Judged(0, math.nan, math.nan)
         super().__init__(settings)
 

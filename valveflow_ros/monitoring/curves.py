@@ -43,21 +43,14 @@ class RunningCurve:
 
     If there is a reference, it gives the predictions: a curve fitted to a fault would hide the
     fault.
-
-    Attributes
-    ----------
-    characteristic : Characteristic or None
-        The curve of the last fit.
-    status : CurveStatus
-    cause : str
-        Why there is no curve, or only a stale or provisional one; empty if it is up to date.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._predictor: Predictor | None = None
-        self.characteristic: Characteristic | None = None
+        self.characteristic: Characteristic | None = None  # the curve of the last fit
         self.status = CurveStatus.UNKNOWN
+        # Why there is no curve, or only a stale or provisional one; empty if it is up to date.
         self.cause = NO_CURVE_YET
 
     @property

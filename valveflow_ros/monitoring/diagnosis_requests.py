@@ -74,24 +74,15 @@ class DiagnosisRequests:
     """Check whether the model fits, request diagnoses, and keep the last one.
 
     While ``alarm`` is raised, the power differs from the curve.
-
-    Attributes
-    ----------
-    misfit : Misfit
-        The largest statistic at the last check.
-    sentence : str
-        Why the model no longer fits; empty while it fits.
-    last : Diagnosed or None
-        The outcome of the last diagnosis.
     """
 
     def __init__(self, settings: Settings, alarm: ResidualAlarm, journal: Journal) -> None:
         self.settings = settings
         self._journal = journal
         self._mismatch = Mismatch(settings.real('sample_period'))
-        self.misfit: Misfit = NOTHING
-        self.sentence = ''
-        self.last: Diagnosed | None = None
+        self.misfit: Misfit = NOTHING  # the largest statistic at the last check
+        self.sentence = ''  # why the model no longer fits; empty while it fits
+        self.last: Diagnosed | None = None  # the outcome of the last diagnosis
         self._found = _Found()
         # `curve.model` creates a new object at each access, and rows arrive one by one.
         self._model: tuple[Characteristic, RegionalModel] | None = None

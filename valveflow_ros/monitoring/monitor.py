@@ -60,11 +60,6 @@ class Monitor(Memory):
         Entries of the columns in `SampleTable.covariates`, which the diagnoses try as causes;
         see `signals.covariates`.
 
-    Attributes
-    ----------
-    rows, last_ns : int
-        Number of rows taken so far, and time of the newest; 0 before the first.
-
     Notes
     -----
     The state changes only by rows and by the calls `adopt`, `refuse`, `operate_alarms`,
@@ -92,6 +87,7 @@ class Monitor(Memory):
         self._window = RollingWindow.of(settings, covariates)
         self.alarm = ResidualAlarm(settings)
         self._force = RunningCurve(settings)
+        # rows, last_ns: number of rows taken so far, and time of the newest; 0 before the first
         self.rows = 0
         self.last_ns = 0
         self._went_back = False

@@ -44,36 +44,21 @@ class ReferenceCurve:
     Later curves replace it in the same way: the reference follows slow wear, but never a fault,
     and stays within `wear_budget` of the first one. During a fault, fits use only rows after its
     onset, and afterwards only rows after its end: no curve mixes both.
-
-    Attributes
-    ----------
-    curve : Characteristic or None
-        Later curves are judged against it.
-    first : Characteristic or None
-        The first one, or the last one set by a user; wear is relative to it.
-    shift : Shift or None
-        The last judgement.
-    problem : str
-        Why a curve could not be judged.
-    fault_ns : int or None
-        Onset of the current fault; 0 if unknown, None if there is no fault.
-    regime_ns : int
-        Fits use rows from this time on.
-    set_ns : int
-        Time when the reference was last set by a user; 0 if never.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.curve: Characteristic | None = None
-        self.shift: Shift | None = None
-        self.problem = ''
+        self.curve: Characteristic | None = None  # later curves are judged against it
+        self.shift: Shift | None = None  # the last judgement
+        self.problem = ''  # why a curve could not be judged
         self.alarm = ShiftAlarm(settings)
+        # Onset of the current fault; 0 if unknown, None if there is no fault.
         self.fault_ns: int | None = None
-        self.regime_ns = 0
-        self.set_ns = 0
+        self.regime_ns = 0  # fits use rows from this time on
+        self.set_ns = 0  # time when the reference was last set by a user; 0 if never
         self._healthy_ns = 0  # regime_ns before the fault
         self._since_ns = 0  # onset of the curve shift, while the alarm stands
+        # The first one, or the last one set by a user; wear is relative to it.
         self.first: Characteristic | None = None
         self._candidate: tuple[int, Characteristic] | None = None
         self._worn: list[tuple[int, float]] = []

@@ -140,22 +140,14 @@ class ChunkFile:
 
     Every method raises the `OSError` of the file. After an error, call `abandon`;
     `messages` and `counts` then describe the complete chunks on disk.
-
-    Attributes
-    ----------
-    messages : int
-        Number of messages in complete chunks.
-    counts : dict[int, int]
-        The same per channel.
-    start_ns, end_ns : int
-        First and last log time among them.
-    position : int
-        Bytes written.
     """
 
     def __init__(self, out: PartFile, library: str) -> None:
+        # position: bytes written
+        # start_ns, end_ns: first and last log time among them
+        # messages: number of messages in complete chunks
         self.messages = self.chunks = self.position = self.start_ns = self.end_ns = 0
-        self.counts: dict[int, int] = {}
+        self.counts: dict[int, int] = {}  # the same per channel
         self._out = out
         self._crc = 0
         self._suspect, self._read_back_s = False, 0.0

@@ -238,15 +238,10 @@ class _ProvenFile(PartFile):
 
 
 class _Copier:
-    """Yields the intact chunks of a file, each preceded by topic records that are still missing.
-
-    Attributes
-    ----------
-    table : TopicTable
-        The topics found so far; after `complete`, all topics of the file.
-    """
+    """Yields the intact chunks of a file, each preceded by topic records that are still missing."""
 
     def __init__(self, source: Source, scanner: Scanner) -> None:
+        # The topics found so far; after `complete`, all topics of the file.
         self.table = TopicTable()
         self._source = source
         self._scanner = scanner

@@ -166,17 +166,11 @@ class Findings:
 
 
 class Scanner:
-    """Scans a file once; `findings` is complete when `chunks` is exhausted.
-
-    Attributes
-    ----------
-    findings : Findings
-    outside : list of Schema or Channel
-        The records found so far outside of chunks, each once.
-    """
+    """Scans a file once; `findings` is complete when `chunks` is exhausted."""
 
     def __init__(self, source: Source) -> None:
         self.findings = Findings()
+        # The records found so far outside of chunks, each once.
         self.outside: list[Schema | Channel] = []
         self._outside_table = TopicTable()
         self._in_summary = False

@@ -153,15 +153,6 @@ class RecordingWriter:
     created, and the messages in it are counted as lost. Raises `RecordingError` if the folder
     cannot be created or used.
 
-    Attributes
-    ----------
-    lost : int
-        Messages written to a file that was damaged, or that was removed before it was finished.
-    removed : int
-        Messages in finished splits that were removed since, by `forget` or by another program.
-    loss : str
-        A sentence about the last loss; empty if nothing was lost.
-
     Parameters
     ----------
     folder : str or Path
@@ -191,8 +182,12 @@ class RecordingWriter:
         self.folder = Path(folder)
         self.name = name or self.folder.resolve().name
         self.attachments: dict[str, bytes] = dict(attachments or {})
+        # removed: messages in finished splits that were removed since, by `forget` or by another
+        # program
+        # lost: messages written to a file that was damaged, or that was removed before it was
+        # finished
         self.lost = self.removed = self.bytes_finished = self.files_finished = 0
-        self.loss = ''
+        self.loss = ''  # a sentence about the last loss; empty if nothing was lost
         self.path: Path | None = None
         self._open_file = open_file
         self._head_messages = head_messages

@@ -138,20 +138,7 @@ def time_cells(frame: pd.DataFrame, time: int, date: int | None) -> pd.Series[An
 
 
 class TableReader:
-    """A table whose columns are assigned to signals; arguments and errors as in `read_table`.
-
-    Attributes
-    ----------
-    names, units, grounds : dict[str, str]
-        By contract column name: the name in the file, the unit in the file, the reason.
-    ignored : tuple of str
-        Columns (in a long table: tags) that are not used.
-    words : dict[str, Counter]
-        By contract column name: counts of the texts that are no numbers. Complete when
-        all blocks were read.
-    bad_times : int
-        Number of rows without a readable time. Complete when all blocks were read.
-    """
+    """A table whose columns are assigned to signals; arguments and errors as in `read_table`."""
 
     def __init__(
         self, path: Path, columns: Mapping[str, str], absent: Collection[str] = (),
@@ -185,14 +172,20 @@ class TableReader:
         used = {c.place for c in self._chosen.values()} | set(self._quality.values())
         used |= taken if self.long is None else set()
         named = enumerate(matcher.names)
+        # Columns (in a long table: tags) that are not used.
         self.ignored = tuple(name for k, name in named if k not in used and name)
+        # names, units, grounds: by contract column name: the name in the file, the unit in the
+        # file, the reason
         self.names = {name: c.theirs for name, c in self._chosen.items()}
         self.units = {n: c.unit.unit for n, c in self._chosen.items() if c.unit is not None}
         self.grounds = {name: c.ground for name, c in self._chosen.items() if c.ground}
+        # By contract column name: counts of the texts that are no numbers. Complete when all
+        # blocks were read.
         self.words: dict[str, Counter[str]] = {name: Counter() for name in self.names}
         self.empty: Counter[str] = Counter()
         self._marked_bad: Counter[str] = Counter()
         self._first_bad: dict[str, tuple[int, str]] = {}
+        # Number of rows without a readable time. Complete when all blocks were read.
         self.bad_times = 0
         self.rows = 0
         self._first_bad_time = 0

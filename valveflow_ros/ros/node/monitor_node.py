@@ -97,13 +97,6 @@ class Watchdog:
 
     Nothing is sent if `NOTIFY_SOCKET` is not set. Pings are sent at twice the rate required by
     `WATCHDOG_USEC`, and only by `completed`, which is called after each complete cycle.
-
-    Attributes
-    ----------
-    period_s : float
-        Time between pings; 0 if none are required.
-    stall_s : float
-        Maximum duration of one step of the recorder before it is considered stuck.
     """
 
     def __init__(
@@ -123,7 +116,8 @@ class Watchdog:
         if not (abstract or name.startswith('/')):
             self._address = b''
         self._usec = int(usec) if valid and own and self._address else 0
-        self.period_s = self._usec / 2e6
+        self.period_s = self._usec / 2e6  # time between pings; 0 if none are required
+        # Maximum duration of one step of the recorder before it is considered stuck.
         self.stall_s = min(_STALL_S, self.period_s)
         self._next_s = 0.0
 

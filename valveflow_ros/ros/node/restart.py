@@ -36,15 +36,6 @@ class Restart:
 
     ``inputs`` and ``outputs`` are the full topic names in this run by contract name; ``log`` is
     called with a level and a sentence.
-
-    Attributes
-    ----------
-    continues : bool
-        True if an earlier run is continued; valid after `engine`.
-    log_ns : int
-        Log time of the newest message in its state or its recording; 0 if there is none.
-    folder : Path or None
-        Its recording if it is continued; None if a new one must be begun.
     """
 
     def __init__(
@@ -63,8 +54,10 @@ class Restart:
         self._log = log
         self._tail: list[LoggedMessage] = []
         self._missing = self._sample = ''
-        self.continues = False
+        self.continues = False  # True if an earlier run is continued; valid after `engine`
+        # Log time of the newest message in its state or its recording; 0 if there is none.
         self.log_ns = 0
+        # Its recording if it is continued; None if a new one must be begun.
         self.folder: Path | None = None
 
     @property

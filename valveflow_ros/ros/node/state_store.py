@@ -207,27 +207,14 @@ class StateStore:
     """Saves the state in a thread, and finds the state that an earlier run saved.
 
     Raises `InUseError` if another monitor keeps its state in the same folder.
-
-    Attributes
-    ----------
-    saved : State or None
-        State of an earlier run, if this run can use it.
-    sentence : str
-        Why an existing state is not used; empty otherwise.
-    lost : bool
-        True if no other run can use it either.
-    problem : str
-        Why the state cannot be saved; empty if it can.
-    saved_s : float or None
-        Monotonic time at which the last state was written.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.saved: State | None = None
-        self.sentence = ''
-        self.lost = False
-        self.problem = ''
-        self.saved_s: float | None = None
+        self.saved: State | None = None  # state of an earlier run, if this run can use it
+        self.sentence = ''  # why an existing state is not used; empty otherwise
+        self.lost = False  # True if no other run can use it either
+        self.problem = ''  # why the state cannot be saved; empty if it can
+        self.saved_s: float | None = None  # monotonic time at which the last state was written
         self._period_s = settings.real('state_period')
         self._begun_s = self._watched_s = self._started_s = time.monotonic()
         # Save soon after the start: a restart uses the recording only with a saved state.
