@@ -47,40 +47,6 @@ Messages = Callable[[Collection[str] | None], Iterator[LoggedMessage]]
 class LogContents:
     """Contents of a log."""
 
-    Attributes
-    ----------
-    path : str
-        The file or folder that was read.
-    readings : Readings
-        The five inputs in the order of their log times, in the units of the file.
-        Readings of equal log time keep the order of the file.
-    log_time_ns : int64 (n,)
-        Time at which each reading was received; for tables the time of the reading.
-    topics : dict[str, TopicInfo]
-        Every topic; empty for tables.
-    signals : dict[Signal, str]
-        Which topic or column each signal comes from.
-    warnings : tuple of str
-        Sentences to show to the user.
-    attachments : dict[str, bytes]
-        Attached files by name.
-    metadata : dict[str, dict[str, str]]
-        Metadata records by name.
-    start_ns, end_ns : int or None
-        First and last log time of any message.
-    damaged_chunks : int
-        Number of places where data were lost.
-    messages : callable
-        Yields the raw messages of the given topics (None for all) in the order of their log
-        times; see `iter_messages`. A table has none.
-    units : dict[Signal, str]
-        The unit that the log states for a signal, for example in the head of a column.
-    grounds : dict[Signal, str]
-        Why a column was assigned to a signal, if the names alone did not decide it.
-    understood : list of str
-        Sentences about what was inferred from the data.
-    """
-
     path: str
     readings: Readings
     # int64 (n,): Time at which each reading was received; for tables the time of the reading.

@@ -243,7 +243,7 @@ def _understood(table: TableImport) -> list[str]:
     lines = [
         f'Read {read}, {step}, {moment(first)} to {moment(last)}.',
         f'Times: {table.time_words}; zone: {zone}.',
-        command.columns(rows, _HEAD),
+        command.table(_HEAD, rows),
     ]
     lines += [source.air for source in sources if source.air]
     for source in sources:

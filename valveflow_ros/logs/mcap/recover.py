@@ -238,7 +238,7 @@ class _ProvenFile(PartFile):
 
 
 class _Copier:
-    """Yields the intact chunks of a file, each preceded by topic records that are still missing."""
+    """Yields the intact chunks of a file, each after the topic records that are still missing."""
 
     def __init__(self, source: Source, scanner: Scanner) -> None:
         # The topics found so far; after `complete`, all topics of the file.

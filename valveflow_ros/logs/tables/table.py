@@ -39,34 +39,6 @@ _BLOCK_ROWS = 100_000
 class RawTable:
     """A table as in its file, except that its rows are in time order."""
 
-    Attributes
-    ----------
-    path : str
-        The file.
-    time_ns : int64 (n,)
-        Times in ns since 1970, not decreasing; equal times keep the order of the file.
-    columns : dict[str, float64 (n,)]
-        By contract column name, in the units of the file; NaN for cells without a number.
-    names : dict[str, str]
-        Name of each column in the file.
-    quality : dict[str, uint8 (n,)]
-        A `Quality` per value, for columns that have a quality column in the file.
-    notes : tuple of str
-        Sentences about what was inferred or left out.
-    bad_cells : dict[str, int]
-        Number of cells that are not empty and hold no number, by contract column name.
-    bad_times : int
-        Number of rows left out because their time cannot be read.
-    units : dict[str, str]
-        The unit in the file, by contract column name.
-    grounds : dict[str, str]
-        Why a column was assigned to a signal, if its name was not exact.
-    ignored : tuple of str
-        Columns (in a long table: tags) that were not used.
-    present : dict[str, bool (n,)]
-        For a long table: the rows that have a value of this signal.
-    """
-
     path: str
     time_ns: IntArray
     # dict[str, float64 (n,)]: By contract column name, in the units of the file; NaN for cells
