@@ -212,7 +212,7 @@ def diagnose(
         )
         notes.append(held_words(earlier.held))
     found, record = _diagnosis(
-        record, regional, model, rows, 'pressure_exponent' in given, progress.part(0.4, 0.5)
+        record, regional, model, rows, 'pressure_exponent' in given, progress.part(0.3, 0.65)
     )
     form = record.form
     usual = StaticForm(exponent=settings.real('pressure_exponent'))
@@ -281,7 +281,9 @@ def _rows(
 ) -> _Rows:  # fmt: skip
     """Align the log and find special segments; continue without them if all signals are there."""
     try:
-        observed = observe_log(log, settings, progress, earlier, said=said)
+        observed = observe_log(
+            log, settings, progress, earlier, progress.part(0.0, 0.35), said
+        )  # fmt: skip
     except DataError as error:
         columns = Covariates.of(log, earlier, said)
         corrector = columns.corrector_of(earlier, settings)
@@ -301,7 +303,7 @@ def _rows(
     if not wanted:
         return rows
     try:
-        model, form = observed.outline(progress, exponent_given)
+        model, form = observed.outline(progress.part(0.0, 0.4), exponent_given)
         return replace(rows, model=model, form=form)
     except DataError as error:
         return replace(rows, why=f'{error} All rows are used instead.')
