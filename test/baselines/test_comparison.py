@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The comparison as a whole, on data made by hand; the truth of a plant."""
 
-import copy
 import json
 from dataclasses import replace
 
@@ -145,22 +144,3 @@ def test_errors_are_those_of_the_curve_and_of_its_parameters():
     assert (off.slope, off.knee, off.intercept) == pytest.approx((0.2, 1.5, 1.0))
     one = curve_error(Line(np.array([0.0, 1.0]), np.ones(1), np.ones(1)), truth, 0.0, 20.0)
     assert np.isnan([one.slope, one.knee, one.intercept]).all()
-
-
-@pytest.mark.parametrize(
-    ('change', 'sentence'),
-    [
-        (lambda raw: [], "a list 'pieces'"),
-        (lambda raw: {'pieces': []}, "a list 'pieces'"),
-        (lambda raw: {'pieces': [3]}, r"'pieces\[0\]' is not an object"),
-        (lambda raw: raw['pieces'][1].pop('slope') and raw, r"'pieces\[1\].slope' is missing"),
-        (lambda raw: raw['pieces'][0].update(u_to=-1.0) or raw, r"'pieces\[0\].u_to' is not"),
-        (lambda raw: raw['pieces'][1].update(u_from=12.0) or raw, r"'pieces\[1\].u_from' is not"),
-        (lambda raw: raw['pieces'][0].update(slope=True) or raw, r"'pieces\[0\].slope' is"),
-        (lambda raw: raw['pieces'][0].update(slope=float('nan')) or raw, 'is out of range'),
-        (lambda raw: raw | {'pressure_exponent': 'x'}, "'pressure_exponent' is not a number"),
-    ],
-)
-def test_what_is_no_truth_is_refused(change, sentence):
-    with pytest.raises(DataError, match=sentence):
-        read_truth(change(copy.deepcopy(RAW)))

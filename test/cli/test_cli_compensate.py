@@ -147,13 +147,6 @@ def test_what_is_no_curve_or_has_no_inverse_is_refused(compensate, model, tmp_pa
     assert 'The inverse is not exact: F(F^-1(x)) differs from x by up to 0.5 MW' in said
 
 
-def test_a_gain_limit_of_ones_own(compensate, model):
-    ran = compensate(model(), '--max-gain', '6', '--json')
-    assert ran.json['useful_mw'] == pytest.approx([150.0, 258.6])
-    none = compensate(model(), '--max-gain', '1')
-    assert 'Nowhere is the gain within its limit' in none.out
-
-
 def test_a_curve_that_depends_on_the_pressure_needs_one(compensate, at_opening):
     """A file of another program states the form and no reference pressure."""
     c, file = at_opening()

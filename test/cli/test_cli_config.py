@@ -100,32 +100,26 @@ def test_what_the_monitor_would_refuse_is_named(run, tmp_path, monkeypatch):
         assert all(part in sentence for part in ['x.yaml', *parts]), text
 
 
-def test_only_sections_for_the_monitor_count(run, tmp_path):
+OWN = '/**:\n  ros__parameters:\n    delay: 3.0\n    use_sim_time: true\n    qos_overrides'
+# Files that are taken: sections of other nodes, and parameters that every node has, do not count.
+GOOD_FILES = [
+    ("'/*/valveflow_monitor':\n  ros__parameters:\n    delay: 3.0\n"
+     'opcua_gateway:\n  ros__parameters:\n    mapping_file: opcua.yaml\n',
+     '1 parameter, 1 differs'),
+    (f'{OWN}:\n      /valve_opening:\n        subscription:\n          depth: 5\n',
+     '1 parameter, 1 differs'),
+    (f'{OWN}./valve_opening.subscription.depth: 5\n', '1 parameter, 1 differs'),
+    ('/unit_1:\n  valveflow_monitor:\n    ros__parameters:\n      delay: 3.0\n',
+     'the monitor takes it'),
+    ('/**:\n  ros__parameters:\n', 'the monitor takes it'),
+]  # fmt: skip
+
+
+def test_what_the_monitor_takes_is_counted(run, tmp_path):
     file = tmp_path / 'x.yaml'
-    file.write_text(
-        "'/*/valveflow_monitor':\n  ros__parameters:\n    delay: 3.0\n"
-        'opcua_gateway:\n  ros__parameters:\n    mapping_file: opcua.yaml\n'
-    )
-    assert '1 parameter, 1 differs from its default' in run('config', 'check', file).out
-
-
-def test_parameters_of_every_node_are_taken(run, tmp_path):
-    file = tmp_path / 'x.yaml'
-    own = '/**:\n  ros__parameters:\n    delay: 3.0\n    use_sim_time: true\n    qos_overrides'
-    for text in (':\n      /valve_opening:\n        subscription:\n          depth: 5\n',
-                 './valve_opening.subscription.depth: 5\n'):  # fmt: skip
-        file.write_text(own + text)
-        assert '1 parameter, 1 differs from its default' in run('config', 'check', file).out
-
-
-@pytest.mark.parametrize(
-    'text', ['/unit_1:\n  valveflow_monitor:\n    ros__parameters:\n      delay: 3.0\n',
-             '/**:\n  ros__parameters:\n']
-)  # fmt: skip
-def test_a_namespace_and_a_node_without_parameters_are_taken(run, tmp_path, text):
-    file = tmp_path / 'x.yaml'
-    file.write_text(text)
-    assert 'the monitor takes it' in run('config', 'check', file).out
+    for text, said in GOOD_FILES:
+        file.write_text(text)
+        assert said in run('config', 'check', file).out, text
 
 
 def test_the_tag_of_a_recording_is_kept(run, tmp_path):
@@ -136,11 +130,6 @@ def test_the_tag_of_a_recording_is_kept(run, tmp_path):
     for words, tag in (((), 'U7'), (('--unit-tag', 'U8'), 'U8')):
         ran = run('config', 'init', tmp_path / 'r', *words).done()
         assert yaml.safe_load(ran.out)['/**']['ros__parameters']['unit_tag'] == tag
-
-
-def test_another_task_is_refused_with_those_there_are(run, tmp_path):
-    sentence = run('config', 'make', tmp_path / 'x.yaml').refused(2)
-    assert "config can init (make a parameter file) or check (one), not 'make'" in sentence
 
 
 def test_a_column_s_name_cannot_write_parameters(run, tmp_path):

@@ -12,7 +12,7 @@ from monitor_recording import recording
 from streams import needs_jit
 
 from benchmarks.refinery_loops import simulate_loop
-from valveflow_ros.cli.main import VERBS, parser_of
+from valveflow_ros.cli.main import VERBS
 
 pytestmark = needs_jit
 
@@ -64,13 +64,6 @@ def plant(tmp_path, logs, identified):
     frame = pd.DataFrame({'time': times, 'FIC101.MV': loop.command, 'FIC101.PV': loop.response})
     frame.to_csv(tmp_path / 'FIC101.csv', index=False)
     return tmp_path
-
-
-def test_every_example_is_understood(run):
-    for verb, _, _ in VERBS:
-        name, *words = example(run(verb, '--help').out)
-        assert name == verb
-        parser_of(verb).parse_args(words)
 
 
 @pytest.mark.parametrize('verb', [

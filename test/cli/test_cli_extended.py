@@ -68,35 +68,6 @@ def test_what_the_extended_model_knows_is_no_finding(run, logs, held, tmp_path):
     assert 'backlash' not in [c['name'] for c in found['causes']]
 
 
-# One thing that is wrong in the file, and what is said of it.
-BAD_MODELS = [
-    ({'format': 'other'}, "'format' must be"),
-    ({'version': 9}, 'has version 9'),
-    ({'causes': [{'name': 'magic', 'values': {}, 'switches_s': []}]}, 'is no cause'),
-    ({'causes': [{'name': 'backlash', 'values': {}, 'switches_s': []}]}, 'is missing'),
-    ({'causes': [{'name': 'backlash', 'values': {'w_percent': -1}, 'switches_s': []}]},
-     'is out of range'),
-    ({'causes': 2 * extended_json(reheater={'alpha': 0.3, 'time_s': 9.0})['causes']},
-     'names a cause twice'),
-    ({'curve': {'knots': [2.0, 1.0], 'left': [1.0], 'right': [2.0]}}, 'do not rise'),
-    ({'curve': {'knots': [1.0], 'left': [], 'right': []}}, 'one knot more'),
-    ({'dynamics': {'levels': [], 'time_constants_s': [], 'delays_s': []}}, 'one level less'),
-    ({'dynamics': {'levels': [], 'time_constants_s': [0.0], 'delays_s': [1.0]}},
-     'out of range'),
-    ({'reference': {}}, 'is missing'),
-    ({'on_top_of': {}}, 'This is no extended model'),
-    ({'start_ns': 'now'}, 'is not a count'),
-]  # fmt: skip
-
-
-def test_a_bad_model_is_refused_with_a_sentence(run, logs, tmp_path):
-    path = tmp_path / 'model.json'
-    words = ('identify', logs / 'plant.parquet', '-o', tmp_path / 'o', '--model', path)
-    for change, said in BAD_MODELS:
-        path.write_text(json.dumps({**extended_json(), **change}))
-        assert said in run(*words).refused()
-
-
 def test_what_does_not_go_together_is_refused(run, logs, held, tmp_path):
     log, extended, curve = (
         logs / 'plant.parquet', held / 'extended_model.json', held / 'characteristic.json',
