@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A browser without a head, spoken to through a pipe: what a person would see and do."""
 
-from __future__ import annotations
-
 import base64
 import fcntl
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every test may ask for: a ROS domain of its own, the real data; how hypothesis runs."""
 
-from __future__ import annotations
-
 import fcntl
 import importlib.util
 import itertools

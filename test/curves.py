@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Characteristics and regional models made by hand or drawn: everything in them is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An ``extended_model.json`` for the simulated plant of the tests, as ``diagnose`` writes one."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording as a monitor leaves one, made without a monitor: messages encoded field by field."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping

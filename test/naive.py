@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slow truths: obvious loops in extended precision that the fast code is compared with."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -6,8 +6,6 @@ Nothing here is fast, bounded in memory or clever, and nothing is shared with th
 engine but its settings and the words of `records`.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real OPC UA server in a process of its own, which does what a test tells it."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

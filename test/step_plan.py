@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The traditional manual test: constant pressure, the opening raised in steps and held."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

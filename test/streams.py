@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams the engine is tested on, ways of cutting them, and a form to compare events in."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

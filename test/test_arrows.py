@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who may import whom: between the folders, and between the modules inside each of them."""
 
-from __future__ import annotations
-
 import ast
 import functools
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every command of README and handbook is run here, in a folder of its own, as a reader would."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages keep up with the code: tables, effects, links, pictures, figures and sentences."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

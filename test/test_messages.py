@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The messages read like documentation and keep to what tools can show, as do our layouts."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

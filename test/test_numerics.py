@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work on several cores, and compiled code: used again while nothing that it is of changes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

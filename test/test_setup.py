@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The set-up: which Python it takes, what it says of a machine that lacks something, env.sh."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

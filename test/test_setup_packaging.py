@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The packages' metadata agree with each other, with the contract and with the lock."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 import os

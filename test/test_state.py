@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an object remembers: a copy both ways, in the kinds it had, or a sentence."""
 
-from __future__ import annotations
-
 import enum
 import hashlib
 import io

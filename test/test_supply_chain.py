@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is installed is what was chosen, and nothing that is read is ever run."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Logs to run the command on, and a way to run it in this process."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inverse table against the curve it came from, and against obvious loops."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The judgement of a shift, and the change of a mean that it rests on: slow truths, relations."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

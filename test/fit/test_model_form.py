@@ -5,8 +5,6 @@
 The units here are drawn in tables of flow: no hinge, no exponent grid and no engine makes them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

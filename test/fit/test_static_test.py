@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A static flow test: steady rows far apart become a curve; rows that move do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The manual step test: levels found, means, refusals, and the curve through them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

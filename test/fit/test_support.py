@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which pieces rest on data of their own."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Logs to call the interface on."""
 
-from __future__ import annotations
-
 import pytest
 
 import valveflow_ros as vf

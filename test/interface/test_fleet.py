@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``fleet``: the numbers of the single verbs, whatever happens to workers and logs."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

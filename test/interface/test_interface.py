@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``import valveflow_ros as vf``: the verbs as functions, DataFrames in and out, results."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

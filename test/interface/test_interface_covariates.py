@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Columns beside the signals: read, tried as causes, kept with the model; drifts without them."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The examples of ``docs/python.md`` and the notebook run, one after the other, as shown."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One folder for the results of several verbs: nothing of another verb is lost."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

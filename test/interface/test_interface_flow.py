@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A flow in place of the power, a pressure difference in place of the pressure, any fluid."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

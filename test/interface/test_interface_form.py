@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The form of the static power through the verbs: found, given, wrong, and put to use."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of curves and models with one thing changed, through every door that reads them."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json

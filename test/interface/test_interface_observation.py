@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A finished log as the engine sees it, also where its clock goes back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from streams import needs_jit

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``Characteristic.power`` and ``.opening``: each undoes the other, and says what it knows."""
 
-from __future__ import annotations
-
 import math
 
 import curves

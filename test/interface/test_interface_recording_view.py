@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recording of a monitor tells, as frames of the terminal view."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

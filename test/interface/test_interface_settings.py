@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapping options, parameters, and the settings that follow from the data; plausible values."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path

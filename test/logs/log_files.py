@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small recordings, the reader of others, and slow truths for the tests of logs."""
 
-from __future__ import annotations
-
 import os
 import struct
 import time

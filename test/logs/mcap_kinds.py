@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Legal MCAP recordings of all kinds: where topics are told, what is packed, what is left out."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

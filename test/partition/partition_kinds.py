@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of many kinds to try the partition on: kind, and hard kinds that numerics dislike."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

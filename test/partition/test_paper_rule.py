@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's rule (24), its guard, and its answer where there is no choice."""
 
-from __future__ import annotations
-
 import math
 
 import naive

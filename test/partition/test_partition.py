@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The partition as its users see it: truth, relations, hostile input, the trap."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search against the plain dynamic programme: every number of pieces, every end."""
 
-from __future__ import annotations
-
 import threading
 
 import naive

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop against plain Python without arrays; the actuator by its laws."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

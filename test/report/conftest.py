@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An identification made by hand: everything in it is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

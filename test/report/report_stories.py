@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A monitor's recording and a diagnosis made by hand, for the pages that tell of them."""
 
-from __future__ import annotations
-
 import html
 import re
 

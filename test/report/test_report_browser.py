@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages in a real browser without a head, where there is one: drawn, touched, printed."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

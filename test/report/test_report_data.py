@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is drawn of the data, thinned for the eye; numbers as people and pictures read them."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

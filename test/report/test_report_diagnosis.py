@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a diagnosis: the answer with its doubts first, then the four steps."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

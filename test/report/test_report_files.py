@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures as PNG and SVG, and what they show as CSV; what numba's cache says of the first run."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a monitor's recording, by its own schemas, to the history its page tells."""
 
-from __future__ import annotations
-
 import html
 import re
 from dataclasses import replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of an identification: whole, closed to the network, and telling the right numbers."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import itertools

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The terminal: a view that always fits, the board behind it, and a bar of progress."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import math

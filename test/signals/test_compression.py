@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Logs that a historian compressed: detection, holding, and what must not be taken for one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The form of the static power: what a curve is a function of, and what it is multiplied by."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What judges the project's speed, judged by what must hold of any judge; all programs load."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmark for naming causes: the set is the same for all, tells nothing, scores right."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

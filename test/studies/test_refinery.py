@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study of single loops: what its result says is what the interface says."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
