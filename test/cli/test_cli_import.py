@@ -60,16 +60,6 @@ def test_columns_are_converted_and_told(run, tmp_path, history):
     assert told['signals'][0]['written_unit'] == 'fraction'
 
 
-def test_constants_stand_in_every_row(run, tmp_path, history):
-    log = tmp_path / 'x.mcap'
-    words = [*OPTIONS[:4], *OPTIONS[8:], '--constant', 'main_steam_pressure=120:bar',
-             '--constant', 'main_steam_temperature_degc=540']  # fmt: skip
-    ran = run('import', history, '-o', log, *words).done()
-    assert values(log, Signal.MAIN_STEAM_PRESSURE).tolist() == pytest.approx([12.0] * 50)
-    assert values(log, Signal.MAIN_STEAM_TEMPERATURE).tolist() == [540.0] * 50
-    assert 'constant' in ran.out
-
-
 def mapped(signal, theirs):
     """Return the options with another column for one signal."""
     return [w if not w.startswith(f'{signal}=') else f'{signal}={theirs}' for w in OPTIONS]

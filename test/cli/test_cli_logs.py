@@ -93,20 +93,6 @@ def test_a_log_that_is_there_is_not_replaced_by_accident(run, tmp_path):
     assert 'not empty' in run('simulate', '-o', bag, *SHORT).refused()
 
 
-def test_another_unit_and_recording_are_simulated_and_told(run, tmp_path):
-    words = ['simulate', '-o', tmp_path / 'a.csv', *SHORT, '--unit', 'choked', '--recording']
-    ran = run(
-        *words, 'minute', '--truth', tmp_path / 't.json', '--effect', 'area_step:t0_days=0'
-    ).done()
-    assert 'choked: flow p^m f(V)' in ran.out
-    assert 'recorded minute' in ran.out
-    truth = json.loads((tmp_path / 't.json').read_text())
-    assert truth['form'] == 'opening'
-    assert truth['effects'][0]['name'] == 'area_step'
-    assert len(read_table(tmp_path / 'a.csv').time_ns) == 28
-    assert 'no recording' in run(*words, 'hourly', '--overwrite').refused(2)
-
-
 def test_info_tells_what_is_there(run, logs):
     ran = run('info', logs / 'plant.mcap')
     data = run('info', logs / 'plant.mcap', '--json').json

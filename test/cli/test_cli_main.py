@@ -189,6 +189,7 @@ REFUSED = [
     ('simulate -o none/x.mcap', 1, 'there is no folder'),
     ('simulate -o x.mcap --seed -1', 2, '0 or more'),
     ('simulate -o x.mcap --effect gain_drif', 2, "Did you mean 'gain_drift'"),
+    ('simulate -o x.csv --recording hourly', 2, 'no recording'),
     ('simulate -o x.mcap --effect gain_drift:h=1', 2, "no parameter 'h'"),
     ('simulate -o x.mcap --effect gain_drift:g=big', 2, "not 'big'"),
     ('simulate -o x.csv --truth no/t.json', 1, 'cannot be written'),

@@ -23,30 +23,6 @@ DAY_NS = 86_400 * 10**9
 HOUR_NS = DAY_NS // 24
 
 
-def test_a_fault_stands_to_the_end_and_files_and_answer_say_the_same(run, tmp_path):
-    log, out = tmp_path / 'plant.parquet', tmp_path / 'out'
-    fault = 'curve_step:s_mw=-12,t0_days=0.9'
-    assert run('simulate', '-o', log, '--days', '1.5', '--effect', fault).status == 0
-    ran = run(
-        'monitor', log, '-o', out, '--no-diagnosis', '--json', '--set', 'sample_period=10',
-        '--set', 'refine=false', '--set', 'selection_rule=paper',
-    ).done()  # fmt: skip
-    content = json.loads((out / 'monitor.json').read_text())
-    assert (content['format'], content['version']) == ('valveflow/monitor', 1)
-    assert content['diagnoses'] == []
-    answer = json.loads(ran.out)
-    assert {key: answer[key] for key in content} == content
-    residual = [a for a in content['alarms'] if a['name'] == 'residual']
-    assert [(a['state'], a['cleared']) for a in residual] == [('unacknowledged', None)]
-    raised = residual[0]['raised']
-    assert content['reference']['set'] >= raised
-    # No curve of later is made from rows of before and since.
-    later = [c for c in content['curves'] if c['adopted'] > content['reference']['set']]
-    assert later
-    assert all(c['window_from'] > raised - 2 * 3600 * 10**9 for c in later)
-    assert (out / 'report.html').exists()
-
-
 def ended(hour, verdict, sentence, **causes):
     """Return a diagnosis that ended, with the meaning and the to-do of each cause."""
     named = [{'name': k, 'meaning': m, 'to_do': d} for k, (m, d) in causes.items()]
@@ -136,7 +112,7 @@ def test_a_shift_has_the_date_of_the_cause_that_the_last_diagnosis_names(told, o
     assert [words for _, words in gone.standing][1] == 'Less, onset unknown.'
 
 
-def test_slow_wear_is_told(told, tmp_path):
+def test_slow_wear_is_told(told, run, logs, tmp_path):
     wear = Wear(DAY_NS, -3.04, -1.013)
     out, page, _ = told(wear=wear)
     sentence = (
@@ -144,8 +120,11 @@ def test_slow_wear_is_told(told, tmp_path):
     )
     assert sentence in out
     assert sentence in page
-    content = json.loads((tmp_path / 'monitor.json').read_text())['wear']
-    assert content == {'since_ns': wear.since_ns, 'total_mw': -3.04, 'mw_per_month': -1.013}
+    content = json.loads((tmp_path / 'monitor.json').read_text())
+    drift = {'since_ns': wear.since_ns, 'total_mw': -3.04, 'mw_per_month': -1.013}
+    assert content['wear'] == drift
+    answer = run('monitor', logs / 'plant.csv', '-o', tmp_path, '--json').json
+    assert {key: answer[key] for key in content} == content
 
 
 # The fleet.

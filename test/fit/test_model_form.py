@@ -8,10 +8,8 @@ The units here are drawn in tables of flow: no hinge, no exponent grid and no en
 import numpy as np
 import pytest
 
-import valveflow_ros as vf
 from valveflow_ros.errors import TooFewSamplesError
 from valveflow_ros.fit.model_form import find_form, find_misfit
-from valveflow_ros.plant.thermal_unit import random_unit
 from valveflow_ros.signals.static_form import INTEGRATED_INPUT, OPENING, StaticForm
 
 HOURS, PER_HOUR = 60, 60
@@ -188,13 +186,3 @@ def test_what_a_curve_gets_wrong_is_told_with_its_place(seed) -> None:
     # What comes once and never again is no fault of the curve.
     once = np.where(np.arange(len(y)) < 400, 15.0, 0.0)
     assert find_misfit(v, p, y - right + once, y, spans, PERIOD_S) is None
-
-
-@pytest.mark.parametrize('number', [21, pytest.param(22, marks=pytest.mark.long)])
-def test_another_exponent_of_the_papers_form_is_fitted_with_the_curve(number) -> None:
-    unit = f'integrated_input:number={number},vacuum_per_kpa=0'
-    curve = vf.identify(vf.simulate(5.0, number, unit=unit, recording='minute').log).characteristic
-    true = random_unit('integrated_input', number).exponent
-    assert abs(true - PAPER) > 0.02
-    assert curve.pressure_exponent == pytest.approx(true, abs=0.01)
-    assert any('The exponent m of the pressure was fitted' in note for note in curve.notes)

@@ -95,16 +95,6 @@ def test_what_is_left_is_white_and_as_large_as_the_noise():
     assert eigenvalues.min() > -1e-9 * eigenvalues.max()
 
 
-def test_without_noise_it_is_exact():
-    result = refine(measured(TRUE, 3, noise=1e-6), START)
-    u = np.linspace(1010.0, 1990.0, 50)
-    assert result.model.static(u) == pytest.approx(TRUE.static(u), abs=0.02)
-    for k in (0, -1):
-        assert result.model.time_constants[k] == pytest.approx(TRUE.time_constants[k], rel=1e-2)
-        assert result.model.delays[k] == pytest.approx(TRUE.delays[k], abs=0.05)
-    assert result.innovation_mw < 1e-2
-
-
 @pytest.mark.parametrize(
     'start',
     [

@@ -12,13 +12,10 @@ from hypothesis import strategies as st
 from step_plan import StepPlan, step_test
 from streams import INTERPRETED, START_NS, examples, grid_ns, table_of
 
-from valveflow_ros.curve.characteristic_json import from_json, to_json
-from valveflow_ros.curve.compensation import compensate
 from valveflow_ros.errors import DataError
 from valveflow_ros.fit.step_levels import holds, looks_like_step_test
 from valveflow_ros.fit.step_test import (
     ENOUGH,
-    RULE,
     Points,
     broken_line,
     identify_step_test,
@@ -179,18 +176,6 @@ def test_the_error_of_a_level_is_the_one_it_has():
             off.append((level.power_mw - paper_curve()(np.array([level.u]))[0])
                        / level.power_error_mw)  # fmt: skip
     assert 0.7 < np.std(off) < 1.4
-
-
-def test_the_result_is_a_characteristic_like_any_other():
-    found = identify_step_test(by_hand([40.0, 50.0, 60.0, 70.0]), QUICK)
-    curve = from_json(to_json(found.characteristic))
-    assert to_json(curve) == to_json(found.characteristic)
-    assert curve.choice.rule == RULE
-    assert len(curve.pieces) == 3
-    assert [p.slope for p in curve.pieces] == pytest.approx([0.1] * 3, abs=0.003)
-    assert all(0.0 < p.slope_stderr < 0.002 for p in curve.pieces)
-    made = compensate(curve)
-    assert made.identity_mw < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 """Which pieces rest on data of their own."""
 
 import dataclasses
-import json
 import re
 
 import numpy as np
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 from streams import examples, grid_ns
 
 from valveflow_ros.curve.characteristic import Piece
-from valveflow_ros.curve.characteristic_json import from_json, to_json
 from valveflow_ros.fit.result import support_of, with_support
 from valveflow_ros.records import SegmentKind
 from valveflow_ros.segments.window import WindowContents
@@ -122,23 +120,6 @@ def test_pieces_that_lack_the_same_data_share_a_sentence():
     assert re.search(r'operation at each of about \d+, \d+ and \d+ MW would \w+ them\.$', said)
 
 
-def test_what_pieces_rest_on_and_the_confidence_survive_json():
-    found = curve([1000.0, 1400.0, 1800.0], [0.2, 0.1])
-    choice = dataclasses.replace(found.choice, confidence={1: 0.0125, 2: 0.9875})
-    window = contents((1100.0, 1300.0, SLOPE), (1500.0, 1500.0, STEADY))
-    told = with_support(dataclasses.replace(found, choice=choice), window, NOISE)
-    raw = json.loads(json.dumps(to_json(told)))
-    assert raw['selection']['confidence'] == {'1': 0.0125, '2': 0.9875}
-    assert [p['identifiable'] for p in raw['pieces']] == [True, False]
-    assert from_json(raw) == told
-    for piece in raw['pieces']:  # as another program, or an older version, wrote it
-        del piece['identifiable'], piece['support']
-    del raw['selection']['confidence']
-    plain = from_json(raw)
-    assert plain.support == ()
-    assert plain.choice.confidence == {}
-
-
 @pytest.mark.parametrize(
     ('stderr', 'words'),
     [
@@ -155,13 +136,3 @@ def test_a_slope_with_a_small_error_is_not_told_as_uncertain(stderr, words):
     (said,) = (note for note in told if note.startswith('Piece 1 '))
     assert 'has steady data at one load only' in said
     assert words in said
-
-
-def test_a_single_piece_rests_on_no_pieces_beside_it():
-    whole = curve([1000.0, 1400.0], [0.2])
-    pieces = tuple(dataclasses.replace(p, slope_stderr=0.002) for p in whole.pieces)
-    window = contents((1200.0, 1200.0, STEADY))
-    (*_, said) = with_support(dataclasses.replace(whole, pieces=pieces), window, NOISE).notes
-    assert said.startswith('Piece 1 ')
-    assert 'steady data at one load only: its slope follows from the samples in which' in said
-    assert 'beside' not in said

@@ -23,7 +23,6 @@ from log_files import (
     plant_sample,
     read_back,
     records,
-    same_arrays,
     stock,
     wander,
     write_chunks,
@@ -33,7 +32,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from valveflow_ros.errors import DataError, InputError, RecordingError
-from valveflow_ros.logs import Message, RecordingWriter, open_log, write_samples, write_table
+from valveflow_ros.logs import Message, RecordingWriter, open_log, write_samples
 from valveflow_ros.logs.mcap.importing import write_readings
 from valveflow_ros.records import SIGNALS, SampleTable, table_to_readings
 
@@ -162,13 +161,6 @@ def test_only_the_owner_may_look(tmp_path):
         os.umask(before)
     assert modes_in(path.parent) == {0o600}
     assert modes_in(path.parent.parent) | modes_in(tmp_path) == {0o700}
-
-
-def test_a_folder_is_continued(tmp_path):
-    (_, first, _), (_, second, _) = (write_chunks(tmp_path / 'log') for _ in range(2))
-    assert names_in(tmp_path / 'log') == ['log_0.mcap', 'log_1.mcap', 'metadata.yaml']
-    assert len(by_rosbags(tmp_path / 'log')) == len(first) + len(second)
-    assert information(tmp_path / 'log')['message_count'] == len(first) + len(second)
 
 
 def test_a_topic_has_one_type_and_perhaps_a_definition_of_the_caller(tmp_path):
@@ -307,15 +299,3 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path):
     with pytest.raises(RecordingError, match='cannot be written'):
         write_samples(wander(3, seed=1), tmp_path / 'file' / 'log.mcap', definitions=STOCK)
     assert names_in(tmp_path) == ['file']
-
-
-def test_readings_are_the_same_from_any_kind_of_file(tmp_path):
-    table = wander(500, seed=21)
-    quality = np.where(np.isnan(table.values), 2, 0).astype(np.uint8)
-    plain = SampleTable(table.time_ns, table.values, quality)
-    write_table(plain, tmp_path / 'table.csv')
-    write_samples(plain, tmp_path / 'log.mcap', definitions=STOCK)
-    first, second = (open_log(tmp_path / n).readings for n in ('table.csv', 'log.mcap'))
-    assert np.array_equal(first.time_ns, second.time_ns)
-    assert np.array_equal(first.value, second.value, equal_nan=True)
-    assert not same_arrays(first, second), 'a table knows which values are missing'

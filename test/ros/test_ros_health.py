@@ -194,17 +194,6 @@ def test_a_silent_covariate_is_told_without_a_warning():
     scene.says(Level.ERROR, 'which the monitor cannot take', name)
 
 
-def test_publishers_that_do_not_fit_are_named():
-    scene = Scene()
-    scene.publishers[OPENING] = Publishers(1, ('std_msgs/msg/Float32',))
-    scene.says(Level.ERROR, '/plant/valve_opening is published as std_msgs/msg/Float32')
-    scene.publishers[OPENING] = Publishers(2)
-    scene.says(Level.WARN, '/plant/valve_opening has 2 publishers')
-    scene.silence()
-    scene.publishers = {PLANT_SAMPLE: STRING}
-    scene.says(Level.ERROR, '/plant/plant_sample is published as std_msgs/msg/String')
-
-
 def test_a_signal_that_comes_in_two_ways_is_named():
     scene = Scene()
     scene.publishers[PLANT_SAMPLE] = Publishers(1)

@@ -22,7 +22,6 @@ from valveflow_ros.monitoring.events import (
     Diagnosed,
     DiagnosisRequested,
     DiagnosisTask,
-    Event,
     JournalEntry,
     JournalKind,
 )
@@ -47,7 +46,6 @@ SETTINGS = Settings({'refit_period': 3600.0, 'refit_segments': 0, 'alarm_on_dela
 TABLE = simulate(0.24, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.17'])).table
 REFERENCE = example_curve(SETTINGS).with_id()
 DEAD = 'The fit process ended unexpectedly (signal SIGKILL).'
-Calls = list[list[Event]]
 
 
 class SlowWorker:

@@ -20,7 +20,6 @@ from valveflow_msgs.msg import Alarm
 
 from valveflow_ros.cli.main import main
 from valveflow_ros.curve.characteristic_json import to_json
-from valveflow_ros.diagnosis.result import model_to_json
 from valveflow_ros.errors import ParameterError, RecordingError
 from valveflow_ros.interface import parameter_files
 from valveflow_ros.logs import open_log
@@ -52,29 +51,6 @@ def lifted():
 # The files
 
 
-def test_a_reference_and_a_model_are_read_from_their_files(lifted, tmp_path):
-    assert parameter_files.given_reference(Settings()) is None
-    path = tmp_path / 'characteristic.json'
-    path.write_text(json.dumps(to_json(lifted)), encoding='utf-8')
-    read = parameter_files.given_reference(Settings({'reference_file': str(path)}))
-    assert read is not None
-    assert to_json(read) == to_json(lifted)
-
-    assert parameter_files.given_model(Settings()) is None
-    assert parameter_files.corrector_for(None, Settings()) is None
-    assert parameter_files.model_attachment(None) == {}
-    path = write_extended(tmp_path / 'extended_model.json', **HELD)
-    settings = Settings({'model_file': str(path)})
-    given = parameter_files.given_model(settings)
-    assert given is not None
-    assert model_to_json(given) == extended_json(**HELD)
-    corrector = parameter_files.corrector_for(given, settings)
-    assert corrector is not None
-    assert [h.name for h in corrector.held] == list(HELD)
-    kept = parameter_files.model_attachment(given)[parameter_files.ATTACHMENT]
-    assert json.loads(kept) == extended_json(**HELD)
-
-
 def test_a_model_that_follows_a_covariate_needs_its_topic(tmp_path):
     vacuum = {
         'name': 'vacuum', 'values': {'b': -1.2, 'a1': 0.0, 'a2': 0.0}, 'switches_s': [],
@@ -102,24 +78,6 @@ def test_a_model_that_follows_a_covariate_needs_its_topic(tmp_path):
     power = corrector.correct(rows).column(Signal.GENERATED_POWER)
     # Two kPa above the usual 5 take 1.2 MW each.
     assert power[-1] == pytest.approx(200.0 + 2.4, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ('parameter', 'text', 'said'),
-    [
-        ('model_file', '{"format": "x"}', "'format' must be"),
-        ('model_file', json.dumps({**extended_json(), 'causes': None}), "'causes' is not a list"),
-        ('reference_file', json.dumps(extended_json()), "'format' must be"),
-    ],
-)
-def test_a_file_of_another_kind_is_refused_with_a_sentence(tmp_path, parameter, text, said):
-    path = tmp_path / 'given.json'
-    path.write_text(text, encoding='utf-8')
-    of_model = parameter == 'model_file'
-    read = parameter_files.given_model if of_model else parameter_files.given_reference
-    with pytest.raises(ParameterError, match=said) as caught:
-        read(Settings({parameter: str(path)}))
-    assert str(caught.value).startswith(f"Parameter '{parameter}' names")
 
 
 @pytest.mark.ros
