@@ -112,14 +112,6 @@ def test_a_piece_without_data_of_its_own_is_marked_and_says_what_would_help():
     assert with_support(found, everywhere, NOISE).notes == found.notes
 
 
-def test_pieces_that_lack_the_same_data_share_a_sentence():
-    found = curve([1000.0, 1200.0, 1400.0, 1600.0, 1800.0], [0.2, 0.15, 0.1, 0.05])
-    window = contents(*[(u, u, STEADY) for u in (1050.0, 1250.0, 1450.0)], (1620.0, 1790.0, SLOPE))
-    (said,) = with_support(found, window, NOISE).notes[len(found.notes) :]
-    assert said.startswith('Pieces 1, 2 and 3 have steady data at one load only')
-    assert re.search(r'operation at each of about \d+, \d+ and \d+ MW would \w+ them\.$', said)
-
-
 @pytest.mark.parametrize(
     ('stderr', 'words'),
     [

@@ -18,14 +18,10 @@ import valveflow_ros as vf
 from valveflow_ros.cli.main import main
 from valveflow_ros.curve.shift import minute
 from valveflow_ros.errors import DataError, InputError, RecordingError, UsageError
-from valveflow_ros.interface.observation import settings_for
 from valveflow_ros.logs import write_table
 from valveflow_ros.logs.mcap.importing import write_readings
-from valveflow_ros.monitoring.monitor import Monitor
-from valveflow_ros.monitoring.offline import align_all, feed_aligned
 from valveflow_ros.records import SIGNALS, SampleTable, Signal, table_to_readings
 from valveflow_ros.report.words import moment, percent
-from valveflow_ros.signals.align import Aligner
 
 QUICK = {'refine': False, 'selection_rule': 'paper'}
 JUNE_NS = 1_717_200_000 * 10**9
@@ -381,16 +377,6 @@ class TestMonitor:
         without = replace(told, events=tuple(early))
         assert without.largest_evidence[1] > 1.0
         assert 'but not for alarm_on_delay (15 min).' in without.evidence_words
-
-    def test_it_says_what_the_engine_fed_in_one_go_says(self, log):
-        given = {**QUICK, 'refit_segments': 8, 'diagnosis_hour': -1}
-        settings, _ = settings_for(log.steps(), 0.0, given, live=True)
-        engine, events = Monitor(settings), []
-        for aligned in align_all(Aligner(settings), log.readings):
-            events += feed_aligned(engine, aligned)
-        told = vf.monitor(log, parameters=given)
-        ids = [e.characteristic.model_id for e in events if type(e).__name__ == 'CurveAdopted']
-        assert [c.model_id for _, c in told.curves] == ids != []
 
     def test_a_model_and_a_reference_go_with_it(self, log, identified, tmp_path):
         model = write_extended(tmp_path / 'model.json', output_offset_drift={'b_mw': 8.0})

@@ -14,7 +14,7 @@ from datetime import timedelta, timezone
 
 import numpy as np
 import pytest
-from report_stories import diagnosed, history, words_of
+from report_stories import words_of
 
 from valveflow_ros.curve.characteristic import Support
 from valveflow_ros.curve.segment_residual import segment_residuals
@@ -30,9 +30,8 @@ from valveflow_ros.report.curve import (
     shift_section,
     surface_figure,
 )
-from valveflow_ros.report.diagnosis import diagnosis_page
 from valveflow_ros.report.figure import Figure, time_axis, upright
-from valveflow_ros.report.identification import identification_page, identification_report
+from valveflow_ros.report.identification import identification_report
 from valveflow_ros.report.page import Page, Section, packed_plotly, read_text
 from valveflow_ros.report.words import in_zone
 from valveflow_ros.signals.static_form import OPENING, integrated_input
@@ -360,16 +359,6 @@ def test_a_missing_library_is_one_sentence(monkeypatch, tmp_path):
         monkeypatch.setattr(page, 'find_spec', lambda name, spec=spec: spec)
         with pytest.raises(InputError, match=said):
             page.packed_plotly()
-
-
-def test_pointing_at_anything_tells_a_unit(identified):
-    unit = re.compile(r'MW|%|°C| s<|\bh<|samples|J = |\d{4}-\d\d-\d\d')
-    data = replace(identified, history=history(), reference=identified.characteristic)
-    for figure in [*identification_page(data).figures, *diagnosis_page(diagnosed()).figures]:
-        for trace in figure.traces:
-            if trace.get('hoverinfo') != 'skip':
-                told = trace.get('hovertext') or [trace.get('hovertemplate', '')]
-                assert all(unit.search(h) or h.startswith('breakpoint') for h in told), figure.name
 
 
 @pytest.mark.parametrize(
