@@ -19,6 +19,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 LOG = simulate(0.11, 7, effects=effects_of(['gain_step:g=-0.12,t0_days=0.085'])).table
 # Rows at the fault, when its alarm has been raised for a while, and at the end.
 FAULT, RAISED, PLAYED = 7344, 9104, 9204
+TAKEN, UNDER_WAY = 'Samples taken in all runs', 'Refit under way for (s)'
 
 
 class Plant(Listener):
@@ -45,7 +46,10 @@ class Plant(Listener):
         raised = Alarm.UNACKNOWLEDGED
         self.until(lambda: self.alarms and self.alarms[-1].state == raised, 'the alarm')
         # What is still being computed or on its way is heard too.
-        self.quiet(3.0)
+        self.health.clear()
+        self.until(lambda: self.value('fit', TAKEN) == str(RAISED), 'all samples', 60.0)
+        self.until(lambda: self.value('fit', UNDER_WAY) == 'unknown', 'the last fit')
+        self.quiet(0.5)
 
     def play_to(self, end, known):
         """Go on once a monitor listens that is not among the known ones, and knows of us."""
@@ -54,7 +58,7 @@ class Plant(Listener):
         publishers = 'input valve_opening', 'Publishers'
         self.until(lambda: self.value(*publishers) not in ('', '0'), 'the monitor knowing us')
         self.play(RAISED, end)
-        self.quiet(1.0)
+        self.until(lambda: self.value('fit', TAKEN) == str(end), 'the last sample', 60.0)
 
     def operate(self, name, action):
         request = OperateAlarm.Request(name=name, action=action)
@@ -95,14 +99,15 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     assert first.poll() is None
 
     plant.play_to_the_alarm()
-    # After these the state has just been saved, and is not due for a second.
-    assert plant.operate('residual', 'shelve')[0]
-    assert plant.operate('residual', 'unshelve')[0]
-    # What a service confirmed survives a kill that follows at once.
+    # After this the state has just been saved, and is not due for a second. What a service
+    # confirmed survives a kill that follows at once.
+    success, sentence = plant.operate('residual', 'shelve')
     killed(first)
+    assert success
+    assert sentence.startswith('The alarm residual is shelved for 8 h; then it comes back')
     plant.quiet(0.5)
-    raised, curve, known = plant.alarms[-1], plant.curves[-1], plant.listeners()
-    assert (raised.state, raised.previous_state) == (Alarm.UNACKNOWLEDGED, Alarm.SHELVED)
+    shelved, curve, known = plant.alarms[-1], plant.curves[-1], plant.listeners()
+    assert (shelved.state, shelved.previous_state) == (Alarm.SHELVED, Alarm.UNACKNOWLEDGED)
 
     before = len(plant.alarms)
     plant.curves.clear()
@@ -114,13 +119,14 @@ def test_killed_and_started_again_it_goes_on_with_curve_alarm_and_recording(
     # Who listens from now on finds what stands, as it was told before: nothing in it is new.
     plant.until(lambda: len(plant.alarms) > before, 'the standing alarm')
     plant.quiet(0.5)
-    assert [a for a in plant.alarms[before:] if a.occurrence] == [raised]
-    assert plant.standing() == [raised]
-    told = f'from before, alarm residual, unacknowledged: {raised.sentence}'
+    assert [a for a in plant.alarms[before:] if a.occurrence] == [shelved]
+    assert plant.standing() == [shelved]
+    told = f'from before, alarm residual, shelved: {shelved.sentence}'
     assert told in processes.output(third)
+    assert plant.operate('residual', 'unshelve')[0]
     assert plant.trigger('acknowledge_alarms')[0]
     plant.until(lambda: plant.alarms[-1].state == Alarm.ACKNOWLEDGED, 'the acknowledgement')
-    assert plant.alarms[-1].occurrence == raised.occurrence
+    assert plant.alarms[-1].occurrence == shelved.occurrence
     plant.play_to(PLAYED, known)
     ended(processes, third, 10.0)
 
@@ -145,28 +151,18 @@ def with_other_parameters_it_goes_on_from_what_was_confirmed(processes, plant, f
         'record': False, 'state_directory': str(folder / 'state_unit'), 'steady_min': 150.0,
         'alarm_floor': 2.0, 'alarm_suppress_time': 86400.0,
     }  # fmt: skip
-    first = start_monitor(processes, folder, **given)
+    monitor = start_monitor(processes, folder, **given)
     before = 'from before, alarm residual, acknowledged'
-    plant.until(lambda: before in processes.output(first), 'the alarm of before')
+    plant.until(lambda: before in processes.output(monitor), 'the alarm of before')
     changed = 'Since the state was saved steady_min changed. Segments were found again in '
-    assert changed in processes.output(first)
+    assert changed in processes.output(monitor)
     assert [(a.name, a.state) for a in plant.standing()] == [('residual', Alarm.ACKNOWLEDGED)]
     for name, action, words in (
         ('', 'shelve', "There is no alarm ''; choose residual or curve_shift."),
         ('residual', 'stop', "There is no action 'stop'; choose acknowledge, shelve or unshelve."),
         ('residual', 'unshelve', 'The alarm residual is not shelved.'),
-        (
-            'curve_shift',
-            'acknowledge',
-            'There is nothing to acknowledge of the alarm curve_shift.',
-        ),
-    ):
+        ('curve_shift', 'acknowledge',
+         'There is nothing to acknowledge of the alarm curve_shift.'),
+    ):  # fmt: skip
         assert plant.operate(name, action) == (False, words)
-    success, sentence = plant.operate('residual', 'shelve')
-    killed(first)
-    assert success
-    assert sentence.startswith('The alarm residual is shelved for 8 h; then it comes back')
-    second = start_monitor(processes, folder, **given)
-    before = 'from before, alarm residual, shelved'
-    plant.until(lambda: before in processes.output(second), 'the shelved alarm')
-    ended(processes, second, 10.0)
+    ended(processes, monitor, 10.0)
