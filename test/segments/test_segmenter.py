@@ -221,8 +221,8 @@ def test_steady_segments_of_the_simulated_plant_tell_its_true_curve():
     """The power without noise in them is F(u), without bias."""
     log, u = simulated(3, 1)
     table = log.table
-    stream = Stream(table.time_ns, u, table.column(Signal.GENERATED_POWER),
-                    table.column(Signal.MAIN_STEAM_TEMPERATURE))  # fmt: skip
+    names = (Signal.GENERATED_POWER, Signal.MAIN_STEAM_TEMPERATURE)
+    stream = Stream(table.time_ns, u, *(np.ascontiguousarray(table.column(s)) for s in names))
     found = spans(whole(Settings(), stream)[0].found)
     truth = log.unit.curve
     steady = [(a, b) for a, b, kind in found if kind == SegmentKind.STEADY]
