@@ -24,8 +24,9 @@ MORE = {
     'watch': ['--once'], 'simulate': ['--days', '0.5'], 'identify': QUICK, 'compare': QUICK,
     'monitor': [*QUICK, '--no-diagnosis'],
 }  # fmt: skip
-# Its workers take longest to begin; what they do is tested without the command.
-LONG = {'fleet'}
+# The workers of a fleet take longest to begin, and the methods of a comparison to be tuned; both
+# are tested without the example.
+LONG = {'fleet', 'compare'}
 
 
 # A file that must be there afterwards.

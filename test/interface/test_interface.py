@@ -475,7 +475,10 @@ class TestOtherUnits:
         refused = {n for c in found.data.counts.values() for r, n in c.items() if r != 'accepted'}
         assert refused == {0}
 
-    @pytest.mark.parametrize('kind', ['choked', 'sequence', 'integrated_input'])
+    @pytest.mark.parametrize('kind', [
+        'sequence', pytest.param('choked', marks=pytest.mark.long),
+        pytest.param('integrated_input', marks=pytest.mark.long),
+    ])  # fmt: skip
     def test_half_a_day_of_a_sliding_unit_gets_the_right_form(self, kind):
         plant = vf.simulate(0.5, 604, unit=f'{kind}:number=604')
         curve, truth = vf.identify(plant.log).characteristic, plant.data.truth

@@ -228,9 +228,11 @@ SEDATE = Settings({'refit_period': 43_200.0, 'refit_segments': 0})
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('seed', [21, pytest.param(22, marks=pytest.mark.long)])
-def test_a_healthy_plant_calls_at_most_once_in_ten_minutes_for_days(seed):
-    monitor, events = run(SEDATE, simulate(2.5, seed).table, {90_000: 'set_reference'})
+@pytest.mark.parametrize(('days', 'seed'), [
+    (1.5, 21), *(pytest.param(2.5, seed, marks=pytest.mark.long) for seed in (21, 22)),
+])  # fmt: skip
+def test_a_healthy_plant_calls_at_most_once_in_ten_minutes_for_days(days, seed):
+    monitor, events = run(SEDATE, simulate(days, seed).table, {90_000: 'set_reference'})
     assert monitor.characteristic is not None
     assert monitor.reference.curve is not None
     raised = [c.time_ns for c in of_type(events, AlarmChange) if c.state == UNACKNOWLEDGED]
