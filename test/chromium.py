@@ -19,7 +19,6 @@ _HIGH = 20  # the browser's own ends are 3 and 4; ours must not stand in the way
 
 
 def installed() -> str | None:
-    """Return the first browser found."""
     return next((path for name in BROWSERS if (path := shutil.which(name))), None)
 
 
@@ -59,7 +58,6 @@ class Chromium:
             self.call(f'{domain}.enable')
 
     def close(self) -> None:
-        """End the browser and wait for it."""
         self._session = ''
         try:
             self.call('Browser.close')
@@ -70,7 +68,6 @@ class Chromium:
         os.waitpid(self._pid, 0)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Ask the browser for something and return its answer."""
         self._number += 1
         message: dict[str, Any] = {'id': self._number, 'method': method, 'params': parameters}
         if self._session:
@@ -161,6 +158,5 @@ class Chromium:
         return base64.b64decode(pdf['data'])
 
     def hover(self, x: float, y: float) -> None:
-        """Move the mouse there."""
         self.call('Input.dispatchMouseEvent', type='mouseMoved', x=x, y=y)
         self.settle()

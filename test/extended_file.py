@@ -10,7 +10,6 @@ from valveflow_ros.plant.simulator import DEFAULT_START_NS
 
 
 def extended_json(**causes: dict[str, float]) -> dict[str, Any]:
-    """Return the content of the file, with some causes."""
     return {
         'format': 'valveflow/extended_model', 'version': 2, 'pressure_exponent': 1.125,
         'start_ns': DEFAULT_START_NS,
@@ -32,6 +31,5 @@ def extended_json(**causes: dict[str, float]) -> dict[str, Any]:
 
 
 def write_extended(path: Path, **causes: dict[str, float]) -> Path:
-    """Write the file."""
     path.write_text(json.dumps(extended_json(**causes)), encoding='utf-8')
     return path

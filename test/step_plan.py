@@ -47,7 +47,6 @@ class StepPlan:
     speed_percent_per_s: float = 0.5
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
-        """Return corner points of the opening: seconds from the start, and %."""
         openings = np.linspace(self.opening_from_percent, self.opening_to_percent, self.steps + 1)
         move_s = np.abs(np.diff(openings)) / self.speed_percent_per_s
         begins = np.append(0.0, np.cumsum(self.hold_s + move_s))

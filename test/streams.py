@@ -46,7 +46,6 @@ def blocks_of(rows, places):
 
 
 def grid_ns(n, period_s=1.0, start_ns=START_NS):
-    """Return n rows on a grid."""
     return start_ns + np.arange(n, dtype=np.int64) * round(period_s * NS_PER_S)
 
 
@@ -162,7 +161,6 @@ def first_difference(a, b):
 
 
 def column(events, name):
-    """Return a column of all predictions among events."""
     return np.concatenate([getattr(b, name) for b in of_type(events, PredictionBlock)])
 
 

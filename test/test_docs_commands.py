@@ -42,7 +42,6 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return the blocks of a page in their order."""
     source = page.read_text()
     name = str(page.relative_to(ROOT))
     return [

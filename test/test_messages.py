@@ -109,7 +109,6 @@ def test_the_service_answers_as_a_trigger_does_and_is_built_as_written():
 
 
 def test_each_type_is_built_as_written():
-    """The built class has the fields, constants and no others, and starts empty."""
     for path in FILES:
         cls = built('valveflow_msgs.msg', path.stem)
         _, fields, constants = message(path)

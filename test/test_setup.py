@@ -215,7 +215,6 @@ def bare(tmp_path):
 
 
 def add(bare, name, text):
-    """Put a program on the PATH of the bare machine."""
     program = bare / 'bin' / name
     program.write_text(f'#!/bin/sh\n{text}\n')
     program.chmod(0o755)
@@ -320,7 +319,6 @@ def sourced(shell, folder, script, **env):
 
 
 def variables(text):
-    """Read the lines of env; shells count themselves and remember their last word."""
     lines = dict(line.split('=', 1) for line in text.splitlines() if '=' in line)
     return {k: v for k, v in lines.items() if k not in ('_', 'SHLVL', 'OLDPWD')}
 

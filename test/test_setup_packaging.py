@@ -49,13 +49,11 @@ def manifest(folder):
 
 
 def wanted():
-    """The names in requirements.in, without extras, versions and comments."""
     lines = (ROOT / 'requirements.in').read_text(encoding='utf-8').splitlines()
     return {NAME.match(line)[0] for line in lines if line and not line.startswith('#')}
 
 
 def entries():
-    """The entries of the lock: name -> text."""
     found = {}
     for entry in re.split(r'\n(?=[A-Za-z0-9])', LOCK):
         if '==' in entry.split('\n')[0]:
@@ -120,7 +118,6 @@ NATIVE = {
 
 
 def keys(folder):
-    """The names of all dependencies of a package."""
     return {e.text for e in manifest(folder).iter() if e.tag.endswith('depend')}
 
 

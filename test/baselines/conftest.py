@@ -47,11 +47,9 @@ def other_data(noise_mw=1.0, seed=7, shift_mw=0.0, above=9e9, u_shift=0.0):
 
 @pytest.fixture(scope='session')
 def curve():
-    """Return the maker of characteristics."""
     return characteristic
 
 
 @pytest.fixture(scope='session')
 def data():
-    """Return the maker of data to judge by."""
     return other_data

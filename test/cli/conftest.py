@@ -98,7 +98,6 @@ def identification(run, logs, tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def identified(identification):
-    """Return the characteristic.json of the simulated log."""
     return identification[1] / 'characteristic.json'
 
 

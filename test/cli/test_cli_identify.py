@@ -25,7 +25,6 @@ QUICK = ('--set', 'refine=false', '--set', 'selection_rule=paper')
 
 @pytest.fixture(scope='module')
 def quick(run, logs, tmp_path_factory):
-    """Return what the quick way makes of the log, and its folder."""
     folder = tmp_path_factory.mktemp('quick') / 'out'
     return run('identify', logs / 'plant.csv', '-o', folder, '--json', *QUICK), folder
 
@@ -213,7 +212,6 @@ def test_what_cannot_be_drawn_is_told_before_the_long_work(run, tmp_path, monkey
 
 @pytest.fixture(scope='module')
 def levels_log(tmp_path_factory):
-    """Return the log of a manual test with twelve levels."""
     path = tmp_path_factory.mktemp('test') / 'test.mcap'
     plan = StepPlan(opening_from_percent=45.0, opening_to_percent=85.0, steps=11)
     write_samples(step_test(3, plan).table, path)

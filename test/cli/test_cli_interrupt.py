@@ -18,7 +18,6 @@ SAID = 'valveflow: stopped; nothing was left half-written.\n'
 
 @pytest.fixture
 def stopped_at(run, monkeypatch):
-    """Run a verb and press Ctrl-C when its nth part begins, if it has so many."""
     # What a shell starts in the background ignores Ctrl-C, and so may this process.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(sys, 'unraisablehook', sys.unraisablehook)

@@ -24,7 +24,6 @@ HOUR_NS = DAY_NS // 24
 
 
 def ended(hour, verdict, sentence, **causes):
-    """Return a diagnosis that ended, with the meaning and the to-do of each cause."""
     named = [{'name': k, 'meaning': m, 'to_do': d} for k, (m, d) in causes.items()]
     content = {'verdict': verdict, 'sentence': sentence, 'causes': named}
     task = SimpleNamespace(window_end_ns=hour * HOUR_NS)
@@ -83,7 +82,6 @@ def test_a_cause_that_the_last_diagnosis_does_not_name_is_in_the_answer(told):
 
 
 def raised(hour, name, sentence):
-    """Return the rise of an alarm."""
     return AlarmChange(
         hour * HOUR_NS, name, AlarmState.UNACKNOWLEDGED, AlarmState.NORMAL, Priority.HIGH, 5.0,
         1.0, 'MW', sentence, 1, hour * HOUR_NS, 'abc',

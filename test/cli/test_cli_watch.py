@@ -138,8 +138,6 @@ def test_without_its_libraries_the_page_is_told_of(run, monkeypatch, tmp_path):
 
 
 class Terminal:
-    """A process on a terminal of its own."""
-
     def __init__(self, *words, **environment):
         self.text = ''
         self._master, slave = pty.openpty()

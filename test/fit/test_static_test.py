@@ -31,7 +31,6 @@ def flow_test(seed: int, rows: int = 47, noise_mw: float = 0.25, step_s: float =
 @pytest.mark.parametrize('seed', [1, 2, 11])
 @pytest.mark.parametrize(('rows', 'step_s'), [(47, 60.0), (90, 30.0)])
 def test_three_pieces_and_their_knees_are_found(seed: int, rows: int, step_s: float) -> None:
-    """Knees within 2 % of the truth; no dynamics; the table is said to be a static test."""
     found = vf.identify(flow_test(seed, rows, step_s=step_s))
     c = found.characteristic
     assert len(c.pieces) == 3
@@ -63,7 +62,6 @@ def test_the_order_of_rows_does_not_matter() -> None:
 
 
 def test_twice_the_power_is_twice_the_curve() -> None:
-    """Scale of the power goes through; knees stay."""
     frame = flow_test(6)
     other = frame.assign(generated_power_mw=2.0 * frame['generated_power_mw'])
     one, two = (vf.identify(f).characteristic for f in (frame, other))

@@ -31,7 +31,6 @@ TIMES = ('read_s', 'identify_s', 'diagnose_s', 'monitor_s', 'task_s')
 
 @pytest.fixture(scope='module')
 def plants(simulation, tmp_path_factory):
-    """Return a folder of two units: '007' with two logs, and 'broken' with a log that is none."""
     folder = tmp_path_factory.mktemp('plants')
     frame = simulation.to_dataframe().iloc[::10]
     later = frame.assign(time=frame.time + pd.Timedelta(days=31))

@@ -97,7 +97,6 @@ def write_chunks(folder, chunks=20, per_chunk=5, close=True):
 
 
 def write_part(folder, chunks=20):
-    """Write what `write_chunks` does, and leave it unfinished as a dead writer."""
     part, wanted, writer = write_chunks(folder, chunks, close=False)
     writer.abandon()
     return part, wanted
@@ -157,7 +156,6 @@ def records(raw):
 
 
 def chunk_ends(raw):
-    """Return where each chunk ends."""
     return [end for op, _, end in records(raw) if op == Opcode.CHUNK]
 
 
@@ -209,7 +207,6 @@ def put(recorder, first, count=1):
 
 
 def rotate(recorder):
-    """Write what waits and begin a new split."""
     wait_for(lambda: recorder.status().queued == 0)
     finished = recorder.status().files_finished
     recorder.rotate()
@@ -222,7 +219,6 @@ def balanced(status):
 
 
 def values_in(folder):
-    """Return the values of the one topic that a reader finds."""
     try:
         return open_log(folder).readings.value.tolist()
     except RecordingError:

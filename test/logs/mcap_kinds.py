@@ -72,7 +72,6 @@ class Kind:
     shuffled: bool = False
 
     def messages(self):
-        """Return the messages of each chunk."""
         chunks = []
         for chunk in range(self.chunks):
             steps = list(range(4 * chunk, 4 * chunk + 4))
@@ -115,7 +114,6 @@ class Kind:
         return chunks, 4 * len(CHANNELS) * (len(made) - sum(made))
 
     def write(self):
-        """Return the file."""
         return _File(self).whole()
 
 

@@ -12,14 +12,12 @@ ROWS = [f'2026-01-05 12:00:{k:02},50,13,538,{600 + k}' for k in range(20)]
 
 
 def csv(path, rows=ROWS, head=HEAD, encoding='utf-8'):
-    """Write a table; ``path`` may be its folder."""
     path = path / 'table.csv' if path.is_dir() else path
     path.write_bytes('\n'.join([head, *rows, '']).encode(encoding))
     return path
 
 
 def timed(*times):
-    """Return a row for each time."""
     return [f'{time},50,13,538,{600 + k}' for k, time in enumerate(times)]
 
 
@@ -29,7 +27,6 @@ def ns(times):
 
 
 def workbook(path, *sheets):
-    """Write sheets named Sheet, Sheet1, ... of rows."""
     openpyxl = pytest.importorskip('openpyxl')
     pytest.importorskip('python_calamine')
     book = openpyxl.Workbook()

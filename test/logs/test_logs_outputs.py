@@ -35,7 +35,6 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def folder(log, tmp_path_factory):
-    """Return the tables in both forms."""
     home = tmp_path_factory.mktemp('tables')
     for suffix in ('.csv', '.parquet'):
         counts = {path.name: n for path, n in write_outputs(log, home / f'said{suffix}').items()}

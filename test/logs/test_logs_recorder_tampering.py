@@ -107,7 +107,6 @@ def sequences(path):
 
 
 def found_by_stock_reader(folder):
-    """Return what the stock reader finds in all files, those recovered that it cannot open."""
     recover_leftovers(folder)
     found = []
     for path in sorted(folder.glob('*.mcap*')):

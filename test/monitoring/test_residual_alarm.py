@@ -159,18 +159,6 @@ def test_sentences_say_how_much_which_way_and_until_when(steps, words):
     assert re.search(words, sentence), sentence
 
 
-@pytest.mark.parametrize(('share', 'words'), [(1.1, '3.3 MW more'), (-1.1, '3.3 MW less')])
-def test_where_the_residual_is_gone_it_still_says_how_far_it_was(share, words):
-    slow = {**NERVOUS, 'alarm_off_delay': 2.0 * DAY_S}
-    _, told = lived(slow, (share, 1), 'restore', (0.0, DAY_S + 60))
-    (_, first), (_, again) = told
-    assert words in first.sentence
-    assert (
-        f'The unit gave {words} than its valve curve (mean over the loads seen). '
-        in again.sentence
-    )
-
-
 def test_the_sentence_names_the_opening_at_which_the_alarm_was_raised():
     settings = Settings(NERVOUS)
     alarm, shares = ResidualAlarm(settings), np.array([0.0, 1.5, 1.5])

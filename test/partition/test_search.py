@@ -47,21 +47,18 @@ def compare(kind, n, shortest, seed=0):
     pytest.fail('the search ended early')
 
 
-@pytest.mark.parametrize('shortest', [2, 33])
-@pytest.mark.parametrize('kind', KINDS)
-def test_every_layer_and_end_is_optimal(kind, shortest):
-    compare(kind, 500 if COMPILED else 140, shortest, seed=shortest)
+# Every kind; blocks that begin and end anywhere; several levels of nodes, and a shortest piece
+# that is longer than a block.
+CASES = [
+    *((kind, 500 if COMPILED else 140, shortest) for kind in KINDS for shortest in (2, 33)),
+    *(('noise', n, 2) for n in (2, 3, 63, 64, 65, 128, 129)),
+    *((kind, 1500, n) for kind, n in (('clumps', 2), ('square', 2), ('valve', 140)) if COMPILED),
+]
 
 
-@pytest.mark.parametrize('n', [2, 3, 63, 64, 65, 128, 129])
-def test_blocks_begin_and_end_anywhere(n):
-    compare('noise', n, 2, seed=n)
-
-
-@pytest.mark.skipif(not COMPILED, reason='too slow without the compiler')
-@pytest.mark.parametrize(('kind', 'shortest'), [('clumps', 2), ('square', 2), ('valve', 140)])
-def test_several_levels_of_nodes_and_a_shortest_piece_longer_than_a_block(kind, shortest):
-    compare(kind, 1500, shortest)
+@pytest.mark.parametrize(('kind', 'n', 'shortest'), CASES)
+def test_every_layer_and_end_is_optimal(kind, n, shortest):
+    compare(kind, n, shortest, seed=n)
 
 
 def test_the_result_does_not_depend_on_the_threads():

@@ -9,7 +9,6 @@ from report_stories import diagnosed, diagnosis, words_of
 
 from valveflow_ros.curve.characteristic import HeldCause
 from valveflow_ros.diagnosis import causes
-from valveflow_ros.diagnosis.result import NOTHING
 from valveflow_ros.report.diagnosis import axis_titles, diagnosis_page, points_to
 from valveflow_ros.report.figure import plain_text
 from valveflow_ros.report.words import decimals, held_words
@@ -43,19 +42,6 @@ def test_the_one_picture_is_the_variable_that_shows_most():
     assert names[0] == 'residual-time'
     assert len(names) == len(set(names)), 'every picture stands once'
     assert {'residual-u', 'fast-moves', 'map-time', 'segments', 'history', 'alarms'} < set(names)
-
-
-def test_a_plant_without_a_fault_is_told_calmly():
-    data = diagnosed()
-    fine = replace(
-        data.diagnosis, verdict=NOTHING, sentence='Nothing is wrong.', causes=(),
-        not_told_apart=(), experiments=(),
-    )  # fmt: skip
-    page = diagnosis_page(replace(data, diagnosis=replace(fine, mean_s=60.0), history=None))
-    assert 'of means over 1 min:' in words_of(page.to_html())
-    assert page.title == 'Simulation and measurement agree'
-    assert page.sections[0].parts[0] == '<p class="good">Nothing is wrong.</p>'
-    assert len(page.sections) == 5
 
 
 def test_every_variable_has_an_axis_and_a_hint():

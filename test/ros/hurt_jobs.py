@@ -16,7 +16,6 @@ from valveflow_ros.ros.node.engine import example_curve
 
 
 def good(task):
-    """Return a curve at once."""
     curve = example_curve(Settings())
     source = replace(curve.source, window_end_ns=int(task.contents.time_ns[-1]))
     return replace(curve, source=source).with_id()
@@ -38,7 +37,6 @@ def greedy(task):
 
 
 def hangs(task):
-    """Never come back."""
     time.sleep(3600.0)
 
 

@@ -46,7 +46,6 @@ class Listener:
         return spin_until(self.executor, condition, what, patience_s)
 
     def quiet(self, seconds):
-        """Listen for a while."""
         until_s = time.monotonic() + seconds
         self.until(lambda: time.monotonic() > until_s, 'the end of a while')
 
@@ -57,7 +56,6 @@ class Listener:
         return self.until(lambda: future.done() and future.result(), name)
 
     def trigger(self, name):
-        """Ask a service; return success and sentence."""
         answer = self.call(Trigger, name, Trigger.Request())
         return answer.success, answer.message
 

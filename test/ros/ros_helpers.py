@@ -53,13 +53,11 @@ class Processes:
         return process
 
     def output(self, process):
-        """Return what a process has said so far."""
         number = self._all.index(process)
         (path,) = self._folder.glob(f'*_{number}.log')
         return path.read_text(errors='replace')
 
     def end_all(self):
-        """Kill what still runs."""
         for process in self._all:
             if process.poll() is None:
                 process.kill()

@@ -41,7 +41,6 @@ def times_of(frame):
 
 
 def steps(frame):
-    """Yield the rows of a plant; every tenth value of the covariate is NaN."""
     for k, time_ns in enumerate(times_of(frame)):
         value = np.nan if k % 10 == 0 else frame[COLUMN].iloc[k]
         row = [(info.topic, float64_bytes(frame[info.column].iloc[k])) for info in REQUIRED]

@@ -39,7 +39,6 @@ def page_of(port, path):
 
 
 def metrics(port):
-    """Return the metrics, empty while there is no page."""
     try:
         return page_of(port, '/metrics')
     except OSError:
@@ -47,7 +46,6 @@ def metrics(port):
 
 
 def newest(port):
-    """Return the time of the newest sample, in seconds."""
     found = re.search(r'^valveflow_sample_timestamp_seconds\S* (\S+)$', metrics(port), re.M)
     return float(found[1]) if found else 0.0
 

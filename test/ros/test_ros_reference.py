@@ -106,7 +106,6 @@ def test_a_recording_without_its_model_is_not_verified(tmp_path):
 
 
 def states(listener):
-    """Return how the alarm on a shift went."""
     return [a.state for a in listener.alarms if a.name == 'curve_shift' and a.occurrence]
 
 

@@ -36,8 +36,6 @@ TABLE = simulate(0.01, 3).table.part(0, 300)
 
 
 class Ears:
-    """Hears all inputs and the clock."""
-
     def __init__(self, context, names):
         self.node = Node('ears', context=context, namespace='plant')
         kinds = {name: INPUT_BY_NAME[name].message_type for name in names}

@@ -352,7 +352,6 @@ def restarted(saved, given, inputs, make=None):
 
 
 def snapshot():
-    """Return the state of an engine with a reference."""
     engine = LiveEngine(Settings(), WORKER)
     engine.monitor.set_reference(CURVE)
     return engine.snapshot()

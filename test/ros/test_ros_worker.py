@@ -125,7 +125,6 @@ def test_a_killed_process_is_seen_at_once_and_replaced_and_nobody_waits_for_it()
 
 
 def killed(made):
-    """Kill the process of a worker and wait until its end can be seen."""
     process = made._process
     assert process is not None
     process.kill()

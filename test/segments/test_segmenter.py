@@ -80,7 +80,6 @@ harm = st.lists(
 
 
 def harmed(stream, harms):
-    """Return a copy with gaps and bad rows."""
     s = Stream(*(a.copy() for a in stream.part(0, len(stream))))
     for what, at, length in harms:
         if at >= len(s):

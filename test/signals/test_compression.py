@@ -107,7 +107,6 @@ def test_a_coarse_record_is_no_compression() -> None:
 
 
 def test_a_clock_that_goes_back_is_no_compression() -> None:
-    """Such a log is read as before."""
     one = recorded(1, Historian('compressed'))
     two = Readings(
         np.concatenate([one.time_ns, one.time_ns]), np.concatenate([one.signal, one.signal]),
@@ -118,7 +117,6 @@ def test_a_clock_that_goes_back_is_no_compression() -> None:
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_few_or_equal_times_are_no_compression(n: int) -> None:
-    """Nothing can be told from them."""
     rows = [(START_NS, s, float(k), 0) for k in range(n) for s in range(4)]
     assert find_compression(Readings.of(rows)) is None
 
@@ -155,7 +153,6 @@ def test_held_values_are_the_slow_truth() -> None:
 
 
 def test_empty_cells_mean_no_new_value() -> None:
-    """NaN between the updates changes nothing."""
     readings = recorded(6, Historian('compressed'))
     rows = np.unique(readings.time_ns)
     table = np.full((len(rows), 4), np.nan)
