@@ -108,7 +108,9 @@ def table_by_load(unit: ThermalUnit) -> list[LoadGain]:
     return gain_by_load(vf.identify(frame).data)
 
 
-@pytest.mark.parametrize('kind', ['choked', 'integrated_input'])
+@pytest.mark.parametrize(
+    'kind', ['choked', pytest.param('integrated_input', marks=pytest.mark.long)]
+)
 def test_in_coarse_rows_the_curve_follows_long_means(kind):
     curve = identified(unit=f'{kind}:number=3').characteristic
     assert any('fitted to means over 10 min: the valve moves' in note for note in curve.notes)

@@ -180,6 +180,7 @@ def test_bad_answers_get_a_sentence(
 
 
 @needs_jit
+@pytest.mark.long
 def test_methods_name_what_is_large_in_the_format_and_baselines_nothing_in_a_healthy_unit() -> (
     None
 ):
