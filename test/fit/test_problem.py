@@ -13,7 +13,7 @@ from streams import examples
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit import problem as module
 from valveflow_ros.fit import whitening
-from valveflow_ros.fit.problem import Problem, Samples, within_bounds
+from valveflow_ros.fit.problem import Problem, Samples, free_parameters, move, within_bounds
 from valveflow_ros.fit.whitening import normal_equations
 
 seeds = st.integers(0, 2**32 - 1)
@@ -205,3 +205,27 @@ def test_any_parameters_become_a_model_that_can_be_run(seed):
     assert np.all((found.delays >= 0.0) & (found.delays <= 600.0))
     again = within_bounds(model, found.pack(), 60.0)
     assert again.pack() == pytest.approx(found.pack(), rel=1e-12)
+
+
+@pytest.mark.parametrize('early', [3, 6])
+def test_a_delay_that_ends_at_0_does_not_keep_the_others_from_their_best(early):
+    rng = np.random.default_rng(early)
+    u = np.clip(500.0 + np.cumsum(rng.normal(0.0, 3.0, N + early)), 300.0, 900.0)
+    true = RegionalModel(
+        np.array([300.0, 520.0, 900.0]), np.array([100.0, 190.0]), np.array([190.0, 260.0]),
+        np.empty(0), np.array([12.0]), np.zeros(1),
+    )  # fmt: skip
+    usable = np.ones(N, dtype=np.uint8)
+    # The power is ahead of the opening: only a delay below 0 could show it.
+    power = naive_respond(true.static(u), np.ones(N + early), [], [12.0], [0.0], 1.0)[early:]
+    problem = Problem(samples_of(u[:N], np.array(power) + rng.normal(0.0, 0.3, N), usable))
+    start = replace(
+        true, knots=np.array([300.0, 600.0, 900.0]), left=np.array([110.0, 200.0]),
+        right=np.array([200.0, 250.0]), time_constants=np.array([30.0]), delays=np.array([4.0]),
+    )  # fmt: skip
+    free = free_parameters(start)
+    found, cost = move(problem, start, np.zeros(4), free, 40)
+    free[found.delay_places] = False
+    _, least = move(problem, replace(start, delays=np.zeros(1)), np.zeros(4), free, 40)
+    assert found.delays[0] == 0.0
+    assert cost == pytest.approx(least, rel=1e-4)
