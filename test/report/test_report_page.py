@@ -215,6 +215,13 @@ def test_what_is_not_known_is_called_unknown(identified):
     figures_of(html)
 
 
+def test_a_power_in_the_head_of_a_table_is_a_superscript():
+    for power, shown in (('(9/8)', '9/8'), ('1.168', '1.168'), ('m', 'm')):
+        html = page.table([f'u (% MPa^{power})'], [['1']])
+        assert f'>u (% MPa<sup>{shown}</sup>)</th>' in html
+    assert page.table(['u'], []) == ''
+
+
 def test_a_straight_curve_has_no_breakpoints(identified):
     pieces = identified.characteristic.pieces[:1]
     html = identification_report(with_curve(

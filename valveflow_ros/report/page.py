@@ -186,7 +186,7 @@ def table(
         return ''
     # Attributes cannot contain HTML.
     labels = [without_tags(h).replace('"', '&quot;') for h in head]
-    head = [re.sub(r'\^\(?([\w./]+)\)?', r'<sup>\1</sup>', h) for h in head]
+    head = [re.sub(r'\^(\()?([\w./]+)(?(1)\))', r'<sup>\2</sup>', h) for h in head]
     many = sentences or len(head) > _MANY
 
     def cell(k: int, html: str) -> str:
