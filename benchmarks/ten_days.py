@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks import study
-from valveflow_ros.cli.command import columns
+from valveflow_ros.cli.command import table
 from valveflow_ros.interface.logs import steps_of
 from valveflow_ros.interface.observation import observe
 from valveflow_ros.interface.settings import settings_for
@@ -91,7 +91,7 @@ def main() -> None:
     rows.append(['total', f'{about["total_wall_s"]:.2f}', f'{about["total_cpu_s"]:.2f}', ''])
     print(f'{given.days:g} days, {size / 1e6:.0f} MB of MCAP, {about["cpus"]} CPUs '
           f'(load {about["load_average"]:.1f}), Python {about["python"]}')  # fmt: skip
-    print(columns(rows, ['step', 'wall s', 'CPU s', 'what']))
+    print(table(['step', 'wall s', 'CPU s', 'what'], rows))
     print(f'Peak memory {about["peak_memory_mib"]:.0f} MiB.')
 
 
