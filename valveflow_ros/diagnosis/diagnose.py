@@ -90,13 +90,10 @@ def confirm(found: SearchResult) -> None:
         worst = max(range(len(chances)), key=lambda k: chances[k])
         if chances[worst] <= LARGEST_P:
             return
-        name = found.model.active[worst].name
-        found.model, _ = improve(found.task, found.model.without(name), 3)
-        found.near.pop(name, None)
-        found.evidence.pop(name, None)
-        found.reasons[name] = (
+        found.withdraw(
+            found.model.active[worst].name,
             'blocks of time that were kept out of the search do not confirm it (a gain as large '
-            f'there has a chance of {chances[worst]:.2g})'
+            f'there has a chance of {chances[worst]:.2g})',
         )
 
 
@@ -488,10 +485,8 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
                 )
             return None
         for name in names:
-            found.model = found.model.without(name)
-            found.evidence.pop(name, None)
-            found.near.pop(name, None)
-            found.reasons[name] = _SO_MANY if so_many else _OF_SHAPE[best.name]
+            why = _SO_MANY if so_many else _OF_SHAPE[best.name]
+            found.withdraw(name, why, found.model.without(name))
         found.model, _ = improve(found.task, found.model, 3)
         other_family = again and best.name in _FAMILIES and best.name not in families
         if other_family and add_of_family(found, best.name):
@@ -592,10 +587,7 @@ def _withdraw_imitations(found: SearchResult) -> None:
         without, _ = improve(found.task, found.model.without(a.name), 3)
         effect = answer(found.task.grids, found.model) - answer(found.task.grids, without)
         if likelier := likelier_over_hours(found.task, without, effect, a.size):
-            found.model = without
-            found.near.pop(a.name, None)
-            found.evidence.pop(a.name, None)
-            found.reasons[a.name] = f'the {likelier} explains the power better'
+            found.withdraw(a.name, f'the {likelier} explains the power better', without)
 
 
 def _withdraw_small(found: SearchResult) -> None:
@@ -611,10 +603,7 @@ def _withdraw_small(found: SearchResult) -> None:
         if own > least:
             least, why = own, 'a model found in another record may be off'
         if a.cause.covariate is None and _explained(found, name) < least**2:
-            found.model, _ = improve(found.task, found.model.without(name), 3)
-            found.near.pop(name, None)
-            found.evidence.pop(name, None)
-            found.reasons[name] = f'it explains less than {least:.2g} MW, by which {why}'
+            found.withdraw(name, f'it explains less than {least:.2g} MW, by which {why}')
 
 
 def _own_size(task: Task) -> float:
@@ -641,11 +630,8 @@ def _withdraw(found: SearchResult, rest: _Rest) -> _Rest:
     before = found.model
     for a in before.active:
         if a.cause.slow and not _explained(found, a.name) > _FAR_MORE * slow.rms_mw**2:
-            found.model = found.model.without(a.name)
-            found.near.pop(a.name, None)
-            found.reasons[a.name] = _OF_SHAPE[
-                NO_SHAPE if rest.course is None else rest.course.name
-            ]
+            shape = NO_SHAPE if rest.course is None else rest.course.name
+            found.withdraw(a.name, _OF_SHAPE[shape], found.model.without(a.name))
     withdrawn = found.model is not before
     if withdrawn:
         found.other_shape = ''

@@ -196,6 +196,15 @@ class SearchResult:
     rough: Grids | None = None
     other_shape: str = ''
 
+    def withdraw(self, name: str, why: str, model: Extended | None = None) -> None:
+        """Remove a cause; ``model`` is the one without it, which is fitted here if not given."""
+        if model is None:
+            model, _ = improve(self.task, self.model.without(name), 3)
+        self.model = model
+        self.near.pop(name, None)
+        self.evidence.pop(name, None)
+        self.reasons[name] = why
+
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'
 
@@ -481,9 +490,7 @@ def _take(found: SearchResult, rival: Rival, gain: float) -> None:
 def _absorb(found: SearchResult, rival: Rival) -> None:
     """Make an effect that an identification may also find part of the plain model: no fault."""
     name = rival.added.name
-    found.evidence.pop(name, None)
-    found.near.pop(name, None)
-    found.reasons[name] = 'it is already included in the fitted curve and dynamics'
+    found.withdraw(name, 'it is already included in the fitted curve and dynamics', found.model)
     whole = replace(rival.model.without(name), base=rival.model.regional)
     found.task, found.model, _ = settle(found.task, whole, rounds=1, steps=3)
     plain = replace(found.plain, base=rival.added.cause.act(found.plain.base, rival.added.values))
@@ -630,10 +637,6 @@ def _drop_weak(found: SearchResult, barred: set[str]) -> None:
         smaller, without = improve(found.task, found.model.without(a.name), 3)
         loss = (without - cost) / (2.0 * variance)
         if loss < KEPT_LEAST + a.size:
-            found.model = replace(smaller)
-            found.evidence.pop(a.name, None)
-            found.near.pop(a.name, None)
-            found.reasons[a.name] = (
-                f'after the causes found later it gains only {loss:.1f} in log-likelihood'
-            )
+            why = f'after the causes found later it gains only {loss:.1f} in log-likelihood'
+            found.withdraw(a.name, why, smaller)
             barred.add(a.name)
