@@ -51,6 +51,8 @@ from valveflow_ros.diagnosis.search import (
     Progress,
     SearchResult,
     add_of_family,
+    in_place_of,
+    put_in_place_of,
     search,
     simplified,
 )
@@ -84,17 +86,43 @@ from valveflow_ros.signals.static_form import StaticForm
 
 
 def confirm(found: SearchResult) -> None:
-    """Remove causes that the sealed blocks do not confirm, the least likely first."""
+    """Remove causes that the sealed blocks do not confirm, the least likely first.
+
+    One that fitted nearly as well is tried there in the place of each; the chance counts all of
+    them.
+    """
+    refuted: set[str] = set()
     while found.model.active:
         chances = _chances(found)
         worst = max(range(len(chances)), key=lambda k: chances[k])
         if chances[worst] <= LARGEST_P:
             return
-        found.withdraw(
-            found.model.active[worst].name,
+        name = found.model.active[worst].name
+        refuted.add(name)
+        why = (
             'blocks of time that were kept out of the search do not confirm it (a gain as large '
-            f'there has a chance of {chances[worst]:.2g})',
+            f'there has a chance of {chances[worst]:.2g})'
         )
+        if not _confirmed_instead(found, name, refuted, why):
+            found.withdraw(name, why)
+
+
+def _confirmed_instead(found: SearchResult, name: str, refuted: set[str], why: str) -> bool:
+    """Replace a refuted cause by one that fitted nearly as well, if the sealed blocks confirm it.
+
+    Return True if they do.
+    """
+    near = set(found.near.get(name, ())) - {*refuted, *found.model.names}
+    if not near:
+        return False
+    without, rivals = in_place_of(found, name, near)
+    tested = len(found.model.active) + len(near)
+    for rival in rivals:
+        if rival.added.name in near:
+            gain = sealed_gain(found.task, without, rival.model, found.tried, tested)
+            if gain.p_value <= LARGEST_P:
+                return put_in_place_of(found, name, rival, rivals, without, why)
+    return False
 
 
 def steps(found: SearchResult) -> list[Extended]:
@@ -638,7 +666,7 @@ def _withdraw(found: SearchResult, rest: _Rest) -> _Rest:
     found.model, _ = improve(found.task, found.model, 3)
     # The effect that these causes explained now belongs to the slow change, which was measured
     # beside them.
-    course = _course(found, again=False) if withdrawn and rest.course else rest.course
+    course = _course(found, again=False) if withdrawn else rest.course
     return replace(rest, drift=drift(found.task, found.model), course=course)
 
 

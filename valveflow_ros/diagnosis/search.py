@@ -591,13 +591,10 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
     the right one may have got a wrong onset.
     """
     for a in found.model.active[:-1]:
-        near = {n for n in found.near.get(a.name, ()) if n not in {*barred, *found.model.names}}
+        near = set(found.near.get(a.name, ())) - {*barred, *found.model.names}
         if not (near or any(u.dated for u in a.cause.unknowns)):
             continue
-        without, _ = improve(found.task, found.model.without(a.name), 3)
-        part = SearchResult(found.task, without, found.plain, found.start, rough=found.rough)
-        others = set(causes_for(found.task.grids)) - near - {a.name}
-        rivals = _visible(part, _rivals(part, others), set())
+        without, rivals = in_place_of(found, a.name, near)
         best = next((r for r in rivals if not _doubt(found.task, r)), None)
         if best is None:
             continue
@@ -609,17 +606,34 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
         gain = (found.task.cost(found.model) - cost) / (2.0 * variance)
         if gain <= PENALTY * (best.added.size - a.size) + _LEAST_EXCHANGE:
             continue
-        evidence = weigh(found.task, without, best.model, best.added.size)
-        if not evidence.enough:
-            continue
-        found.evidence.pop(a.name, None)
-        found.near.pop(a.name, None)
-        _note(found, best, rivals, evidence)
-        if best.added.name != a.name:
-            found.reasons[a.name] = (
-                f'{best.added.name} explains the data better beside the causes found later'
-            )
-        _take(found, best, evidence.gain)
+        why = f'{best.added.name} explains the data better beside the causes found later'
+        put_in_place_of(found, a.name, best, rivals, without, why)
+
+
+def in_place_of(found: SearchResult, name: str, near: set[str]) -> tuple[Extended, list[Rival]]:
+    """Return the model without a cause, and this cause and some others refitted in its place."""
+    without, _ = improve(found.task, found.model.without(name), 3)
+    part = SearchResult(found.task, without, found.plain, found.start, rough=found.rough)
+    others = set(causes_for(found.task.grids)) - near - {name}
+    return without, _visible(part, _rivals(part, others), set())
+
+
+def put_in_place_of(
+    found: SearchResult, name: str, best: Rival, rivals: list[Rival], without: Extended, why: str
+) -> bool:
+    """Replace a cause by a rival that passes the tests; return True if it does.
+
+    ``why`` becomes the reason against the cause, ``without`` is the model without it.
+    """
+    evidence = weigh(found.task, without, best.model, best.added.size)
+    if _doubt(found.task, best) or not evidence.enough:
+        return False
+    found.withdraw(name, why, without)
+    _note(found, best, rivals, evidence)
+    if best.added.name != name:
+        found.reasons[name] = why
+    _take(found, best, evidence.gain)
+    return True
 
 
 def _doubt(task: Task, rival: Rival) -> str:
