@@ -218,7 +218,10 @@ def confounded(label: str, seed: int, days: float, times: tuple[float, float]) -
     return replace(case, kind='confounded', label=label, unit=unit, given=given)
 
 
-def outside(label: str, seed: int, shares: tuple[float, float]) -> Case:
+SHARES = (0.33, 0.6)  # of the noise's sd: 11 to 36 % of its variance
+
+
+def outside(label: str, seed: int, shares: tuple[float, float] = SHARES) -> Case:
     """Return a plant with something in its record that no cause of the catalogue explains.
 
     Its standard deviation is a share of that of the noise, drawn between two limits.

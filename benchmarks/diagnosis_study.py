@@ -191,8 +191,8 @@ def counts(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def main() -> None:
     parser = study.options(__doc__, seeds=1, first=0, days=10.0, low=2.0, high=4.0)
     parser.add_argument('--kind', choices=KINDS, default='hidden')
-    parser.add_argument('--least-share', type=float, default=0.33)
-    parser.add_argument('--largest-share', type=float, default=0.6)
+    parser.add_argument('--least-share', type=float, default=plants.SHARES[0])
+    parser.add_argument('--largest-share', type=float, default=plants.SHARES[1])
     parser.add_argument('--effect', action='append')
     parser.add_argument('--recording', choices=('1s', 'minute'), default='1s')
     given = parser.parse_args()

@@ -284,8 +284,9 @@ def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) 
             told.append((change[1], change[2], _moved(change[0], place)))
     if told and (whole is None or len(told) < tested):
         told.sort(reverse=True)
-        # The piece that the unit visited first after the change dates it best.
-        return _mixture_words(min(since for _, since, _ in told), listed([w for *_, w in told]))
+        # What the unit visited first after the change dates it best.
+        onsets = [since for _, since, _ in told] + ([] if whole is None else [whole[2]])
+        return _mixture_words(min(onsets), listed([words for *_, words in told]))
     if whole is None:
         return ''
     return _mixture_words(whole[2], _moved(whole[0], '(mean over the loads seen)'))
