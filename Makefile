@@ -94,8 +94,8 @@ torture: setup
 
 study: setup
 	@$(ENV) for name in $(STUDIES); do python -m benchmarks.$$name || exit 1; done
-	@$(ENV) for recording in '1s --seeds 10 --first 9201' 'minute --seeds 100 --first 9401' \
-	  'compressed --seeds 10 --first 9301'; do \
+	@$(ENV) for recording in '1s --seeds 10 --first 5201' 'minute --seeds 100 --first 9401' \
+	  'compressed --seeds 10 --first 1401'; do \
 	  python -m benchmarks.thermal_study --kinds choked,sequence,integrated_input \
 	  --recording $$recording || exit 1; done
 
