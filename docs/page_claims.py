@@ -181,9 +181,9 @@ def _diagnosis() -> list[Row]:
         (_PAIRS, 'two causes at once: both named'),
         (_TRIPLES, 'three causes at once: all named'),
         ('outside_55300_55301',
-         'effects outside the catalogue, of 0.33 to 0.6 of the noise: none named'),
+         "effects outside the catalogue, with 0.33 to 0.6 of the noise's sd: none named"),
         ('outside_55362_55363',
-         'effects outside the catalogue, of a quarter of the noise: none named'),
+         "effects outside the catalogue, with a quarter of the noise's sd: none named"),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
         text = f'{r["right"]} of {r["records"]}'

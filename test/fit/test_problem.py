@@ -13,7 +13,14 @@ from streams import examples
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.fit import problem as module
 from valveflow_ros.fit import whitening
-from valveflow_ros.fit.problem import Problem, Samples, free_parameters, move, within_bounds
+from valveflow_ros.fit.problem import (
+    Problem,
+    Samples,
+    free_parameters,
+    move,
+    within_bounds,
+    within_reach,
+)
 from valveflow_ros.fit.whitening import normal_equations
 
 seeds = st.integers(0, 2**32 - 1)
@@ -229,3 +236,22 @@ def test_a_delay_that_ends_at_0_does_not_keep_the_others_from_their_best(early):
     _, least = move(problem, replace(start, delays=np.zeros(1)), np.zeros(4), free, 40)
     assert found.delays[0] == 0.0
     assert cost == pytest.approx(least, rel=1e-4)
+
+
+@pytest.mark.parametrize(('slopes', 'held'), [
+    ((1, -1), [True, True]), ((1, 0), [True, True]), ((-1, -1), [False, False]),
+    ((-1, 1), [False, False]),
+])  # fmt: skip
+def test_breakpoints_as_close_as_they_may_be_do_not_push_each_other(slopes, held):
+    model = RegionalModel(
+        np.array([0.0, 500.0, 504.0, 1000.0]), np.array([0.0, 50.0, 51.0]),
+        np.array([50.0, 51.0, 90.0]), np.empty(0), np.array([9.0]), np.array([3.0]),
+    )  # fmt: skip
+    free = free_parameters(model)
+    slope = np.ones(free.sum())
+    slope[4:6] = slopes
+    _, left = within_reach(model, free, np.eye(len(slope)), slope, 1.0)
+    # One whose cost is flat cannot be told from one that is held.
+    assert [bool(x == 0.0) for x in left[4:6]] == [
+        h or not s for h, s in zip(held, slopes, strict=True)
+    ]

@@ -310,7 +310,7 @@ def from_json(raw: object) -> Characteristic:
 def form_of(top: dict[str, Any], whole: str, inside: str = '') -> StaticForm:
     """Return the form that a model's keys specify, and refuse keys that do not suit the axis.
 
-    Raises `DataError`; the message names the key, which is ``inside`` another one.
+    Raises `DataError` if one does not; the message names the key, which is ``inside`` another one.
     """
     axis = top['axis'] or INTEGRATED_INPUT
     scale, offset = top['pressure_scale_exponent'] or 0.0, top['offset_mw'] or 0.0
@@ -378,7 +378,7 @@ class Joint(enum.Enum):
 def check_pieces(pieces: list[dict[str, Any]], whole: str, path: str, joint: Joint) -> None:
     """Refuse lines that are not in sequence, or have values that no plant has.
 
-    Raises `DataError`; the message names the place.
+    Raises `DataError` for such lines; the message names the place.
     """
     for k, piece in enumerate(pieces):
         begin, before = piece['u_from'], pieces[k - 1] if k else None

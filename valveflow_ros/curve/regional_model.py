@@ -16,8 +16,7 @@ from valveflow_ros.records import ByteArray, FloatArray, IntArray
 class RegionalModel:
     """Curve F of eq. (2) and G_i of eq. (3)."""
 
-    # float64 (J + 1,): Boundaries of the pieces in % MPa^m; the outer pieces extend beyond the
-    # outer ones.
+    # Boundaries of the pieces in % MPa^m, (J + 1,); the outer pieces extend beyond the outer ones.
     knots: FloatArray
     # left, right: float64 (J,), flow in MW at the left and right end of each piece
     left: FloatArray

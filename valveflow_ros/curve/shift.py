@@ -273,7 +273,7 @@ def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) 
         whole = None
     shown = curve.at_pressure(curve.shown_at_mpa)
     least_mw = _MIXED_LEAST * float(np.ptp(shown.model.static(shown.breakpoints)))
-    told: list[tuple[float, int, str]] = []
+    told: list[tuple[float, int, float, str]] = []
     tested = 0
     for index, piece in enumerate(pieces, 1):
         there = found.inside(piece.u_from, piece.u_to)
@@ -281,11 +281,13 @@ def mixture_sentence(curve: Characteristic, segments: Sequence[SpecialSegment]) 
         change = _change_within(there, wander_mw, _MIXED_CHANCE / len(pieces), own=True)
         if change is not None and abs(change[0]) > least_mw and change[1] > _MIXED_ERRORS_OF_PIECE:
             place = f'at {curve.place_words(piece.u_from, piece.u_to)} (piece {index})'
-            told.append((change[1], change[2], _moved(change[0], place)))
+            told.append((change[1], change[2], change[0], _moved(change[0], place)))
     if told and (whole is None or len(told) < tested):
         told.sort(reverse=True)
         # What the unit visited first after the change dates it best.
-        onsets = [since for _, since, _ in told] + ([] if whole is None else [whole[2]])
+        onsets = [since for _, since, *_ in told]
+        if whole is not None and whole[0] * told[0][2] > 0.0:
+            onsets.append(whole[2])
         return _mixture_words(min(onsets), listed([words for *_, words in told]))
     if whole is None:
         return ''

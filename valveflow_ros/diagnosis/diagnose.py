@@ -12,7 +12,8 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import DAY_S, Estimate, FittedCause, SentenceValues, told
-from valveflow_ros.diagnosis.causes import catalogue
+from valveflow_ros.diagnosis.causes import catalogue, causes_for
+from valveflow_ros.diagnosis.causes.changes import LEAST_SWITCHES
 from valveflow_ros.diagnosis.causes.since_model import CURVE, SINCE_MODEL, Change, since_model
 from valveflow_ros.diagnosis.evidence import (
     LARGEST_P,
@@ -79,7 +80,7 @@ from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
 
-# The sealed blocks are a test set, used only once: the gain of each cause on them.
+# The sealed blocks are a test set, used only to confirm: the gain of each cause on them.
 #
 # A cause found on the open blocks is named only if the sealed blocks, to which nothing was
 # fitted, confirm it at the 5 % level.
@@ -91,37 +92,42 @@ def confirm(found: SearchResult) -> None:
     One that fitted nearly as well is tried there in the place of each; the chance counts all of
     them.
     """
-    refuted: set[str] = set()
     while found.model.active:
         chances = _chances(found)
         worst = max(range(len(chances)), key=lambda k: chances[k])
         if chances[worst] <= LARGEST_P:
             return
         name = found.model.active[worst].name
-        refuted.add(name)
+        found.refuted.add(name)
         why = (
             'blocks of time that were kept out of the search do not confirm it (a gain as large '
             f'there has a chance of {chances[worst]:.2g})'
         )
-        if not _confirmed_instead(found, name, refuted, why):
+        if not _confirmed_instead(found, name, why):
             found.withdraw(name, why)
 
 
-def _confirmed_instead(found: SearchResult, name: str, refuted: set[str], why: str) -> bool:
+def _confirmed_instead(found: SearchResult, name: str, why: str) -> bool:
     """Replace a refuted cause by one that fitted nearly as well, if the sealed blocks confirm it.
 
     Return True if they do.
     """
-    near = set(found.near.get(name, ())) - {*refuted, *found.model.names}
+    causes = causes_for(found.task.grids)
+    concealed = {f for a in found.model.active if a.name != name for f in a.cause.conceals}
+    near = {
+        n for n in found.near.get(name, ())
+        if n not in (*found.refuted, *found.model.names) and causes[n].family not in concealed
+        and (found.task.fixed_dynamics or not causes[n].of_model)
+    }  # fmt: skip
     if not near:
         return False
     without, rivals = in_place_of(found, name, near)
+    rivals = [r for r in rivals if r.added.name in near]
     tested = len(found.model.active) + len(near)
     for rival in rivals:
-        if rival.added.name in near:
-            gain = sealed_gain(found.task, without, rival.model, found.tried, tested)
-            if gain.p_value <= LARGEST_P:
-                return put_in_place_of(found, name, rival, rivals, without, why)
+        gain = sealed_gain(found.task, without, rival.model, found.tried, tested)
+        if gain.p_value <= LARGEST_P and put_in_place_of(found, name, rival, rivals, without, why):
+            return True
     return False
 
 
@@ -392,7 +398,7 @@ def diagnose(
     confirm(found)
     _withdraw_imitations(found)
     _withdraw_small(found)
-    found.model = _dated(found)
+    _date(found)
     progress(0.8, 'what is left')
     course = _course(found)
     rest = replace(_look_again(found), course=course, start_ns=found.task.grids.start_ns)
@@ -492,6 +498,11 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
     names = [name for name in found.model.names if name in _LEVELS]
     if names == ['curve_step']:
         names = []  # a single curve_step also depends on the load
+    if len(names) > _MOST_LEVELS:
+        for name in names:
+            found.withdraw(name, _SO_MANY, found.model.without(name))
+        found.model, _ = improve(found.task, found.model, 3)
+        names = []
     tried = courses(found.task, found.model, names)
     if not tried:
         return None
@@ -503,24 +514,23 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
     if names:
         better = best.score - max(tried[shape].score for shape in mine)
         least = _ANOTHER_SHAPE if len(names) == 1 else 0.0
-        so_many = len(names) > _MOST_LEVELS
-        if not so_many and better <= least:
+        if better <= least:
             if better > 0.0 and best.name != NO_SHAPE:
                 words = course_words(best, found.task.grids.start_ns)
                 found.other_shape = (
                     f'Instead of {listed(names)} the power may change in time {words}: this fits '
-                    'the data as well.'
+                    'the data a little better, but not by enough to decide.'
                 )
             return None
         for name in names:
-            why = _SO_MANY if so_many else _OF_SHAPE[best.name]
-            found.withdraw(name, why, found.model.without(name))
+            found.withdraw(name, _OF_SHAPE[best.name], found.model.without(name))
         found.model, _ = improve(found.task, found.model, 3)
         other_family = again and best.name in _FAMILIES and best.name not in families
         if other_family and add_of_family(found, best.name):
             # The causes of another family hid those of this shape.
             confirm(found)
-            found.model = _dated(found)
+            _withdraw_imitations(found)
+            _date(found)
             return _course(found, again=False)
     least_mw = LEAST_DRIFT_MW * found.task.grids.size
     if best.score - tried[NO_SHAPE].score < _LEAST_SHAPE or best.rms_mw <= least_mw:
@@ -580,8 +590,8 @@ _COURSE_STEP_S = 3600
 _DAYS_FROM_H = 48.0
 
 
-def _dated(found: SearchResult) -> Extended:
-    """Return the model with its onsets and hidden states fitted to all blocks.
+def _date(found: SearchResult) -> None:
+    """Fit the onsets and hidden states of the model to all blocks.
 
     The open blocks alone would place a change inside a sealed block at the wrong end of it. The
     hours between that and the true time would look like a misfit or a slow disturbance. Only the
@@ -589,7 +599,10 @@ def _dated(found: SearchResult) -> Extended:
     """
     every = replace(found.task, rows=found.task.grids.whole)
     everywhere = np.ones(every.grids.subs, dtype=bool)
-    return inferred(every, search_onsets(every, found.model), everywhere)
+    found.model = inferred(every, search_onsets(every, found.model), everywhere)
+    for a in found.model.active:
+        if a.cause.infer is not None and len(a.extra) < LEAST_SWITCHES:
+            found.withdraw(a.name, 'it is switched on only once: a change that is undone')
 
 
 def _own_misfit(found: SearchResult, left: Structure) -> str:
@@ -661,13 +674,13 @@ def _withdraw(found: SearchResult, rest: _Rest) -> _Rest:
             shape = NO_SHAPE if rest.course is None else rest.course.name
             found.withdraw(a.name, _OF_SHAPE[shape], found.model.without(a.name))
     withdrawn = found.model is not before
-    if withdrawn:
-        found.other_shape = ''
+    if not withdrawn:
+        return replace(rest, drift=drift(found.task, found.model))
     found.model, _ = improve(found.task, found.model, 3)
     # The effect that these causes explained now belongs to the slow change, which was measured
     # beside them.
-    course = _course(found, again=False) if withdrawn else rest.course
-    return replace(rest, drift=drift(found.task, found.model), course=course)
+    course = _course(found, again=False)
+    return replace(_look_again(found), course=course, start_ns=rest.start_ns)
 
 
 def _explained(found: SearchResult, name: str) -> float:

@@ -249,7 +249,7 @@ def _wald(task: Task, without: Extended, model: Extended, e: FloatArray) -> floa
     return float((column @ before) ** 2 / max(variance, 1e-300))
 
 
-# The gain of a cause on test blocks to which nothing was fitted; they are used once.
+# The gain of a cause on test blocks to which nothing was fitted; they only confirm.
 
 LARGEST_P = 0.05
 _LEAST_PARTS = 8

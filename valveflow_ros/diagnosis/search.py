@@ -183,6 +183,8 @@ class SearchResult:
         The record with longer model rows, for screening.
     other_shape : str
         Words for a change in time that fits as well as the named ones; empty if there is none.
+    refuted : set of str
+        Causes that the sealed blocks did not confirm.
     """
 
     task: Task
@@ -195,6 +197,7 @@ class SearchResult:
     tried: int = 0
     rough: Grids | None = None
     other_shape: str = ''
+    refuted: set[str] = field(default_factory=set)
 
     def withdraw(self, name: str, why: str, model: Extended | None = None) -> None:
         """Remove a cause; ``model`` is the one without it, which is fitted here if not given."""
@@ -204,6 +207,7 @@ class SearchResult:
         self.near.pop(name, None)
         self.evidence.pop(name, None)
         self.reasons[name] = why
+        self.other_shape = ''
 
 
 _BY_CHANCE = 'the power does not follow it more closely than a slow wander would by chance'
@@ -394,7 +398,10 @@ def _note(found: SearchResult, chosen: Rival, rivals: list[Rival], evidence: Evi
     found.evidence[name] = evidence
     found.near[name] = tuple(n for n, by in behind.items() if by < NOT_TOLD_APART)
     for other, by in behind.items():
-        found.reasons[other] = f'{name} explains the data better (log-likelihood {by:+.1f})'
+        if by > 0.0:
+            found.reasons[other] = f'{name} explains the data better (log-likelihood {by:+.1f})'
+        else:
+            found.reasons[other] = f'blocks of time kept out of the search confirm {name}'
 
 
 def add_of_family(found: SearchResult, family: str) -> bool:
@@ -402,7 +409,7 @@ def add_of_family(found: SearchResult, family: str) -> bool:
     causes = causes_for(found.task.grids)
     others = {name for name, cause in causes.items() if cause.family != family}
     hindered = {name for name, cause in causes.items() if cause.hindered(found.task.grids)}
-    return _add(found, others | hindered)
+    return _add(found, others | hindered | found.refuted)
 
 
 def _without_onset(task: Task, rival: Rival) -> str:
@@ -595,9 +602,9 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
         if not (near or any(u.dated for u in a.cause.unknowns)):
             continue
         without, rivals = in_place_of(found, a.name, near)
-        best = next((r for r in rivals if not _doubt(found.task, r)), None)
-        if best is None:
+        if not rivals:
             continue
+        best = rivals[0]
         if best.added.cause.of_model and not found.task.fixed_dynamics:
             continue  # no fault: the fitted dynamics include it
         # The present model may fit better than a new start of the same cause.
@@ -611,11 +618,15 @@ def _exchange(found: SearchResult, barred: set[str]) -> None:
 
 
 def in_place_of(found: SearchResult, name: str, near: set[str]) -> tuple[Extended, list[Rival]]:
-    """Return the model without a cause, and this cause and some others refitted in its place."""
+    """Return the model without a cause, and this cause and some others refitted in its place.
+
+    Those that are no candidates are left out.
+    """
     without, _ = improve(found.task, found.model.without(name), 3)
     part = SearchResult(found.task, without, found.plain, found.start, rough=found.rough)
     others = set(causes_for(found.task.grids)) - near - {name}
-    return without, _visible(part, _rivals(part, others), set())
+    rivals = _visible(part, _rivals(part, others), set())
+    return without, [r for r in rivals if not _doubt(found.task, r)]
 
 
 def put_in_place_of(
@@ -626,7 +637,7 @@ def put_in_place_of(
     ``why`` becomes the reason against the cause, ``without`` is the model without it.
     """
     evidence = weigh(found.task, without, best.model, best.added.size)
-    if _doubt(found.task, best) or not evidence.enough:
+    if not evidence.enough:
         return False
     found.withdraw(name, why, without)
     _note(found, best, rivals, evidence)

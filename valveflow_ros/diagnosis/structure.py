@@ -208,8 +208,9 @@ def _over_hours(task: Task, model: Extended, values: dict[str, FloatArray]) -> S
 def likelier_over_hours(task: Task, model: Extended, effect: FloatArray, size: int) -> str:
     """Return what changes over hours and explains the power better than a cause in time; or ''.
 
-    A unit that runs by a daily programme repeats each day all that its load does to it. The
-    comparison is that of `structure` over hours.
+    A unit that runs by a daily programme repeats each day all that its load does to it, and a
+    change of the programme imitates a step or a drift. The comparison is that of `structure` over
+    hours.
 
     Parameters
     ----------

@@ -66,8 +66,8 @@ def gauss_newton(
         before = cost
         for _ in range(trials):
             step = np.linalg.solve(normal + damping * np.eye(len(scale)), slope / scale) / scale
-            if float(slope @ step) < least_gain * cost:
-                break  # the most that this step can gain
+            if 2.0 * float(slope @ step) < least_gain * cost:
+                break  # no step can gain more in a linear model
             trial = shifted(model, step)
             if trial is not None and (value := cost_of(trial)) < cost:
                 model, cost = trial, value

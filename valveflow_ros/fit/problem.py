@@ -313,9 +313,16 @@ def within_reach(
     wanted = np.zeros(len(packed))
     wanted[free] = _TINY * (1.0 + np.abs(packed[free])) * np.sign(at)
     moved = within_bounds(model, packed + wanted, step_s).pack() - packed
-    held = np.flatnonzero(np.abs(moved - wanted)[free] > 0.5 * np.abs(wanted[free]))
+    held = np.abs(moved - wanted) > 0.5 * np.abs(wanted)
+    # A breakpoint that pushes a held one is held too.
+    moved = within_bounds(model, packed + np.where(held, 0.0, wanted), step_s).pack() - packed
+    knots = slice(model.pieces + 1, 2 * model.pieces)
+    pushed = (held & (np.abs(moved) > 0.5 * _TINY))[knots]
+    held[knots][1:] |= pushed[:-1]
+    held[knots][:-1] |= pushed[1:]
+    places = np.flatnonzero(held[free])
     normal, slope = normal.copy(), slope.copy()
-    normal[held], normal[:, held], slope[held] = 0.0, 0.0, 0.0
+    normal[places], normal[:, places], slope[places] = 0.0, 0.0, 0.0
     return normal, slope
 
 

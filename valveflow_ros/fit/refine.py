@@ -274,22 +274,18 @@ class Refined:
     """The result of a refinement."""
 
     model: RegionalModel
-    # float64 (P, P): Of the packed parameters; block scores allow for correlation that the AR
-    # model leaves.
+    # Of the packed parameters, (P, P); block scores allow for correlation beyond the AR model.
     covariance: FloatArray
     level_stderr: FloatArray  # float64 (I - 1,), of the levels between regions, MW
-    # bool (P,): True for the free packed parameters; jumps not supported by the data are not free.
+    # True for the free packed parameters, (P,); jumps not supported by the data are not free.
     free: BoolArray
-    # float64 (k,): Of the residual of the last fit, whose rows are means over 2 s (or single
-    # rows).
+    # Of the residual of the last fit, (k,); its rows are means over 2 s, or single rows.
     ar: FloatArray
     innovation_mw: float  # sd of that residual after whitening
     # Error of the prediction due to the errors of the parameters, root mean square.
     prediction_mw: float
-    # residual_mw, weight: float64 (m,), uint8 (m,), residual of the means and whether it was
-    # scored
-    residual_mw: FloatArray
-    weight: ByteArray
+    residual_mw: FloatArray  # (m,), of the means
+    weight: ByteArray  # (m,), 1 where it was scored
     row_sd_mw: float  # sd of the residual of single rows
     # Probability of each number of pieces; empty when it was given.
     confidence: dict[int, float] = field(default_factory=dict)
@@ -439,7 +435,7 @@ def search(
     """Find regions and pieces on averaged rows: `refine` without its last fit.
 
     Return the model, and the change of the exponent of the pressure. Raises `TooFewSamplesError`
-    if As in `refine`.
+    as `refine` does.
     """
     model, _, moved, _ = _outlined(samples, start, most_pieces, exponent, usual)
     return model, moved

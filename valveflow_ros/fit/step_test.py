@@ -65,7 +65,7 @@ class BrokenLine:
     knots: FloatArray
     values: FloatArray
     covariance: FloatArray  # float64 (J + 1, J + 1), of the values, with the knots kept fixed
-    # float64 (J - 1,): Standard errors of the inner knots; NaN if a level is the knot.
+    # Standard errors of the inner knots, (J - 1,); NaN if a level is the knot.
     knot_error: FloatArray
     # Weighted sum of squares by number of pieces; empty if each level is a knot.
     cost: dict[int, float]

@@ -31,8 +31,8 @@ _EXPONENT_STEP = 0.01
 class Certainty:
     """Covariance of the estimates."""
 
-    # float64 (P, P): Of the packed parameters. It is 0 for fixed parameters, and NaN for free
-    # parameters that are not determined by the data.
+    # Of the packed parameters, (P, P): 0 for fixed ones, and NaN for free ones that the data do
+    # not determine.
     covariance: FloatArray
     level_stderr: FloatArray  # float64 (I - 1,), standard errors of the levels between regions, MW
     innovation_mw: float  # sd of the whitened residual

@@ -61,8 +61,7 @@ LEARN_SHARE = 2.0 / 3.0
 class Observed:
     """A log processed by the engine, and the inputs of a fit."""
 
-    # SampleTable: The rows in the engine's window; if the clock was set back, without the rows
-    # before that.
+    # The rows in the engine's window; if the clock was set back, without the rows before that.
     table: SampleTable
     rows: IntArray  # int64 (n,), their indices among all rows of the log
     segments: tuple[SpecialSegment, ...]

@@ -47,9 +47,11 @@ Messages = Callable[[Collection[str] | None], Iterator[LoggedMessage]]
 class LogContents:
     """Contents of a log."""
 
-    path: str
+    path: str  # the file or folder that was read
+    # The five inputs in the order of their log times, in the units of the file; readings of equal
+    # log time keep the order of the file.
     readings: Readings
-    # int64 (n,): Time at which each reading was received; for tables the time of the reading.
+    # Time at which each reading was received, (n,); for tables the time of the reading.
     log_time_ns: IntArray
     topics: dict[str, TopicInfo] = field(default_factory=dict)  # every topic; empty for tables
     # Which topic or column each signal comes from.

@@ -199,8 +199,8 @@ async def load_key(path: Path, certificate: Certificate) -> Any:
 async def connected(endpoint: str, security: Security, user: User) -> AsyncIterator[Client]:
     """Open a session, and close it at the end.
 
-    Raises `ValveflowError` if a certificate or key cannot be used, or has expired. Raises
-    `Exception` of asyncua if the server cannot be reached or refuses; see `in_words`.
+    Raises `ValveflowError` if a certificate or key cannot be used, or has expired. Any
+    exception of asyncua is passed on if the server cannot be reached or refuses; see `in_words`.
     """
     from asyncua import Client
     from asyncua.crypto import security_policies

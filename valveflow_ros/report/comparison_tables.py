@@ -149,8 +149,8 @@ def totals_cells(data: Compared) -> Cells:
             *('{} of {}'.format(*j.passed(name, as_paper=paper)) for paper in (True, False)),
         ])  # fmt: skip
     head = [
-        'prediction', 'all segments (MW²)', 'steady (MW²)', 'slope (MW²)', 'all rows (MW²)',
-        'mean difference (MW)', 'zero stands, each sample counted',
+        'mean squared error of', 'all segments (MW²)', 'steady (MW²)', 'slope (MW²)',
+        'all rows (MW²)', 'mean difference (MW)', 'zero stands, each sample counted',
         'zero stands, correlation counted',
     ]  # fmt: skip
     return head, rows

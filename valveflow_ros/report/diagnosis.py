@@ -193,8 +193,8 @@ def _proof(data: Diagnosed) -> Section:
     return html.section(
         '4. Check on held-out data',
         html.paragraph(
-            'Every fifth block of the record was held out: nothing was fitted to it, and it was '
-            'used once. Root mean square difference there, of means over '
+            'Every fifth block of the record was held out: nothing was fitted to it. Root mean '
+            'square difference there, of means over '
             f'{say.duration(d.mean_s)}:'
         ),
         html.table(['model', 'MW'], errors), told if gains else None,

@@ -178,9 +178,8 @@ def table(
     """Return a table of cells given as HTML; empty without rows.
 
     With sentences it is treated as one of many columns. A power such as ^(9/8) in the head is set
-    as a superscript.
-    On a phone a table with many columns shows each row as a list; therefore each cell has the
-    name of its column as an attribute.
+    as a superscript. On a phone a table with many columns shows each row as a list; therefore
+    each cell has the name of its column as an attribute.
     """
     if not rows:
         return ''

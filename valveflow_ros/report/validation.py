@@ -236,7 +236,7 @@ def totals_cells(v: Validation) -> Cells:
         ]
         for name in v.predictions
     ]
-    return ['prediction', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows
+    return ['mean squared error of', 'all (MW²)', 'steady (MW²)', 'slope (MW²)'], rows
 
 
 def segments_table(v: Validation, most: int = 40) -> str:

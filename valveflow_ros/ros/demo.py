@@ -158,7 +158,8 @@ class Story:
         if len(self.curves) == 1:
             knees = ', '.join(f'{u:.0f}' for u in message.breakpoints[1:-1])
             pieces = counted(message.pieces, 'piece')
-            _tell_at(time_ns, f'first curve: {pieces}, breakpoints at u = {knees or "none"}')
+            where = f'breakpoints at u = {knees}' if knees else 'no breakpoint'
+            _tell_at(time_ns, f'first curve: {pieces}, {where}')
 
     def on_alarm(self, message: Alarm) -> None:
         """Print a new alarm; one that was suppressed and is active again is not new."""

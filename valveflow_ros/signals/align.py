@@ -346,7 +346,7 @@ class Aligned:
     """The result of one call: rows, and the resets of the clock among them."""
 
     table: SampleTable  # the closed rows
-    # int64 (k,): Row numbers within ``table`` before which the clock was set back.
+    # Row numbers within ``table`` before which the clock was set back, (k,).
     resets: IntArray
 
 

@@ -265,7 +265,7 @@ _SWITCH_PENALTY = 9.0
 _FIRST_SIZES = (0.003, 0.008, 0.02)
 _FIRST_SHARE = 0.3
 _ROUNDS = 8
-_LEAST_SWITCHES = 3  # on twice: once is a change that is undone, which many things can be
+LEAST_SWITCHES = 3  # on twice: once is a change that is undone, which many things can be
 
 
 def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
@@ -311,9 +311,7 @@ def _search(screening: Screening, size: float) -> Start | None:
     if path.mean() > 0.5:  # the rarer state counts as the event
         path, size = (1 - path).astype(np.uint8), -size
     times = _switches(screening, path)
-    return (
-        screening.displaced(INTERVALS, (size,), times) if len(times) >= _LEAST_SWITCHES else None
-    )
+    return screening.displaced(INTERVALS, (size,), times) if len(times) >= LEAST_SWITCHES else None
 
 
 def _path(

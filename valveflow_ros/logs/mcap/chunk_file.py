@@ -147,7 +147,7 @@ class ChunkFile:
         # start_ns, end_ns: first and last log time among them
         # messages: number of messages in complete chunks
         self.messages = self.chunks = self.position = self.start_ns = self.end_ns = 0
-        self.counts: dict[int, int] = {}  # the same per channel
+        self.counts: dict[int, int] = {}  # messages per channel
         self._out = out
         self._crc = 0
         self._suspect, self._read_back_s = False, 0.0

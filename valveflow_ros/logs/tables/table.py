@@ -39,14 +39,13 @@ _BLOCK_ROWS = 100_000
 class RawTable:
     """A table as in its file, except that its rows are in time order."""
 
-    path: str
+    path: str  # the file
+    # Since 1970, not decreasing; equal times keep the order of the file, (n,).
     time_ns: IntArray
-    # dict[str, float64 (n,)]: By contract column name, in the units of the file; NaN for cells
-    # without a number.
+    # By contract column name, in the units of the file; NaN without a number; each (n,).
     columns: dict[str, FloatArray]
     names: dict[str, str]  # name of each column in the file
-    # dict[str, uint8 (n,)]: A `Quality` per value, for columns that have a quality column in the
-    # file.
+    # A `Quality` per value, (n,), for columns that have a quality column in the file.
     quality: dict[str, ByteArray]
     notes: tuple[str, ...]  # sentences about what was inferred or left out
     # Number of cells that are not empty and hold no number, by contract column name.
@@ -57,7 +56,7 @@ class RawTable:
     # Why a column was assigned to a signal, if its name was not exact.
     grounds: dict[str, str] = field(default_factory=dict)
     ignored: tuple[str, ...] = ()  # columns (in a long table: tags) that were not used
-    # dict[str, bool (n,)]: For a long table: the rows that have a value of this signal.
+    # For a long table: the rows that have a value of this signal, (n,).
     present: dict[str, BoolArray] = field(default_factory=dict)
 
     def readings(self) -> Readings:
