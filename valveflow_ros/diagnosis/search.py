@@ -239,6 +239,11 @@ def search(
                 'results of the fit, with no expected values to compare them with'
             )
             barred.add(name)
+        # What is left of its pressure dependence is an error of the exponent.
+        found.reasons['choked'] = (
+            'cannot be judged: the form p^m F(V) + c is that of a valve that is choked already'
+        )
+        barred.add('choked')
     elif not earlier_curve:
         found.reasons[_BEND] = (
             'cannot be judged without an earlier model whose curve still holds: breakpoints that '
