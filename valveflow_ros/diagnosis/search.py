@@ -182,7 +182,7 @@ class SearchResult:
     rough : Grids, optional
         The record with longer model rows, for screening.
     other_shape : str
-        Words for a change in time that fits as well as the named ones; empty if there is none.
+        Sentence on a change in time that fits a little better than the named one; or ''.
     refuted : set of str
         Causes that the sealed blocks did not confirm.
     """
