@@ -8,7 +8,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any, TypeVar, cast
 
 import numba
@@ -145,6 +145,7 @@ def copied(function: _Function) -> _Function:
 # Python threads for kernels that release the interpreter lock.
 
 T = TypeVar('T')
+R = TypeVar('R')
 _END = object()
 # Interval at which a thread that waits for space checks if it must stop.
 _LOOK_S = 0.2
@@ -202,6 +203,17 @@ def run_in_threads(
         helper.join()
     if errors:
         raise errors[0]
+
+
+def each_in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return ``work(item)`` of every item, computed in as many threads as there are cores."""
+    found: list[Any] = [None] * len(items)
+
+    def one(k: int) -> None:
+        found[k] = work(items[k])
+
+    run_in_threads(one, [(k,) for k in range(len(items))], cores())
+    return found
 
 
 def read_ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:

@@ -154,10 +154,19 @@ def test_places_on_the_curve_are_in_the_unit_of_its_axis(grids, name):
         assert model_from_json(kept).model.active == model.active
 
 
-def test_tangents_of_the_curve_predict_small_changes(grids):
-    model = Extended(replace(
-        rough_model(), levels=np.empty(0), time_constants=np.array([20.0]), delays=np.array([4.0])
-    ))  # fmt: skip
+@pytest.mark.parametrize(
+    'causes',
+    [{}, {'reheater': (0.5, 12.0)}, {'clock': (3.0,)}, {'gain_step': (0.1, 0.5), 'curve_shape':
+     (2.0, 50.0, 10.0)}, {'region_lag': (40.0, 6.0, 300.0), 'output_offset_drift': (5.0,)}],
+    ids=lambda causes: '+'.join(causes) or 'none',
+)  # fmt: skip
+def test_tangents_of_the_curve_predict_small_changes(grids, causes):
+    known = causes_for(grids)
+    base = replace(
+        rough_model(), levels=np.empty(0), time_constants=np.array([20.0]),
+        delays=np.array([4.0]), offset_mw=3.0,
+    )  # fmt: skip
+    model = Extended(base, tuple(FittedCause(known[n], v) for n, v in causes.items()))
     task = Task(grids, grids.whole, np.zeros(ORDER))
     free = np.flatnonzero(base_mask(task, model))
     columns = base_tangents(task, model)
@@ -241,7 +250,7 @@ def test_one_pass_and_two_passes_of_the_filter_agree(grids):
     usable = grids.usable.copy()
     usable[1000:1010] = 0
     rows, means = np.empty(len(x)), np.empty(len(grids.power))
-    kernels.respond(x, usable, path, taps, rows)
+    kernels.respond_means(x, usable, path, taps, 1, rows)
     kernels.respond_means(x, usable, path, taps, grids.group, means)
     np.testing.assert_allclose(means, grids.means(rows), rtol=1e-12)
 

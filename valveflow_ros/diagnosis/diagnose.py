@@ -27,6 +27,7 @@ from valveflow_ros.diagnosis.evidence import (
     rmse,
     sealed_gain,
     where_largest,
+    while_unsure,
 )
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import (
@@ -76,6 +77,7 @@ from valveflow_ros.diagnosis.structure import (
     wander,
 )
 from valveflow_ros.errors import DataError, counted, listed
+from valveflow_ros.numerics import each_in_threads
 from valveflow_ros.records import BoolArray, FloatArray, IntArray, SampleTable
 from valveflow_ros.signals.compression import Compression
 from valveflow_ros.signals.static_form import StaticForm
@@ -146,7 +148,9 @@ def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
     Its chance is that of its gain over the model with all others: without them it may explain
     little, because what they leave is larger than its own effect.
     """
-    gains = [sealed_gain(found.task, a, b, found.tried) for a, b in itertools.pairwise(models)]
+    gains = each_in_threads(
+        lambda pair: sealed_gain(found.task, *pair, found.tried), list(itertools.pairwise(models))
+    )
     if len(gains) < 2:
         return gains
     return [
@@ -156,12 +160,15 @@ def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
 
 def _chances(found: SearchResult) -> list[float]:
     """Return the chance of a gain as large on sealed blocks, of each cause beside the others."""
-    out = []
-    for a in found.model.active:
-        without, _ = improve(found.task, found.model.without(a.name), 3)
-        tested = len(found.model.active)
-        out.append(sealed_gain(found.task, without, found.model, found.tried, tested).p_value)
-    return out
+    task, model = found.task, found.model
+    unsure = while_unsure(task, model)
+
+    def chance(a: FittedCause) -> float:
+        without, _ = improve(task, model.without(a.name), 3)
+        tested = len(model.active)
+        return sealed_gain(task, without, model, found.tried, tested, unsure).p_value
+
+    return each_in_threads(chance, model.active)
 
 
 # Causes found without the model of the unit: in the actuator and in the record.

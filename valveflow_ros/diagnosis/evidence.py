@@ -24,6 +24,7 @@ from valveflow_ros.diagnosis.fitting import (
 from valveflow_ros.diagnosis.grids import DAY_S, FOLDS, ORDER, SEALED_FOLD
 from valveflow_ros.diagnosis.screening import Screening, nuisance
 from valveflow_ros.fit.whitening import fit_ar, inflation
+from valveflow_ros.numerics import each_in_threads
 from valveflow_ros.records import BoolArray, FloatArray, IntArray
 
 # Hidden states: estimated again when a model is judged or used.
@@ -64,8 +65,9 @@ def _crossed(task: Task, model: Extended) -> FloatArray:
     if all(a.cause.infer is None for a in model.active):
         return task.residual(model)
     odd = np.arange(task.grids.subs) % 2 == 1
-    by_even = task.residual(inferred(task, model, ~odd))
-    by_odd = task.residual(inferred(task, model, odd))
+    by_even, by_odd = each_in_threads(
+        lambda allowed: task.residual(inferred(task, model, allowed)), [~odd, odd]
+    )
     return np.where(odd[task.grids.sub], by_even, by_odd)
 
 
@@ -288,8 +290,9 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
 
 
 def sealed_gain(
-    task: Task, before: Extended, after: Extended, tried: int, tested: int = 1
-) -> Gain:
+    task: Task, before: Extended, after: Extended, tried: int, tested: int = 1,
+    unsure: BoolArray | None = None,
+) -> Gain:  # fmt: skip
     """Compare two models, both fitted to the open blocks, on the sealed ones.
 
     Times at which the onset may lie according to the open blocks do not count in the test: there
@@ -299,9 +302,11 @@ def sealed_gain(
     ----------
     tried, tested : int
         Number of causes tried on the open blocks and tested on the sealed ones.
+    unsure : bool (m,), optional
+        Result of `while_unsure` for ``after``, if already known.
     """
     rows = task.grids.sealed_rows
-    told = rows & ~_while_unsure(task, after)
+    told = rows & ~(while_unsure(task, after) if unsure is None else unsure)
     enough = len(np.unique(task.grids.sub[told])) >= _LEAST_PARTS
     sealed = replace(task, rows=told if enough else rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
@@ -310,7 +315,7 @@ def sealed_gain(
     return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
 
 
-def _while_unsure(task: Task, model: Extended) -> BoolArray:
+def while_unsure(task: Task, model: Extended) -> BoolArray:
     """Return the means at times where an onset may lie, shape (m,)."""
     day = task.grids.means(task.grids.time_s) / DAY_S
     out = np.zeros(len(day), dtype=bool)

@@ -171,15 +171,34 @@ def answer(
     x = flow_of(model, driven if driven is not None else drive(grids, model))
     if path is None:
         path = region_path(model, x)
-    taps = model.regional.taps(grids.step_s)
     shown = sorted(model.at(Stage.OUTPUT), key=lambda a: a.cause.order)
-    if not shown:
-        out = np.empty(len(grids.power))
-        kernels.respond_means(x, grids.usable, path, taps, grids.group, out)
-        return out
-    y = np.empty(len(x))
-    kernels.respond(x, grids.usable, path, taps, y)
-    for a in shown:
+    return _shown(grids, model, x, path, shown)
+
+
+def response(grids: Grids, model: Extended, change: FloatArray, path: ByteArray) -> FloatArray:
+    """Return what a small change of x, (n,), makes of the means of the power, (m,)."""
+    return _shown(grids, model, change, path, lags_of(model))
+
+
+def lags_of(model: Extended) -> list[FittedCause]:
+    """Return the causes that delay the power; others only add to it."""
+    late = [a for a in model.at(Stage.OUTPUT) if a.cause.family == 'lag']
+    return sorted(late, key=lambda a: a.cause.order)
+
+
+def _shown(
+    grids: Grids, model: Extended, x: FloatArray, path: ByteArray, causes: list[FittedCause]
+) -> FloatArray:
+    group = 1 if causes else grids.group
+    y = np.empty(len(x) // group)
+    taps = model.regional.taps(grids.step_s)
+    kernels.respond_means(x, grids.usable, path, taps, group, y)
+    return means_through(grids, causes, y) if causes else y
+
+
+def means_through(grids: Grids, causes: list[FittedCause], y: FloatArray) -> FloatArray:
+    """Return the means, (m,), of a power y, (n,), after causes that change it."""
+    for a in causes:
         y = a.cause.act(y, a.values, grids)
     return grids.means(y)
 

@@ -12,12 +12,24 @@ from functools import partial
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
+from valveflow_ros.diagnosis import kernels
 from valveflow_ros.diagnosis.cause import Cause, FittedCause, Kind, Stage, Values
-from valveflow_ros.diagnosis.extended import Extended, answer, drive, flow_of, region_path
+from valveflow_ros.diagnosis.extended import (
+    Extended,
+    answer,
+    drive,
+    flow_of,
+    lags_of,
+    means_through,
+    region_path,
+    response,
+)
 from valveflow_ros.diagnosis.grids import ORDER, Grids
 from valveflow_ros.fit.descent import descend, gauss_newton
+from valveflow_ros.fit.kernels import tangents
 from valveflow_ros.fit.problem import (
     free_parameters,
+    stretches,
     with_level_moved,
     within_bounds,
     within_reach,
@@ -183,6 +195,7 @@ _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)
 _LINE_SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
 _SLOW_MEANS = 720  # two hours
 _LARGEST_SUM = 0.9
+_SMALL = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +212,10 @@ class Task:
 
     def innovations(self, series: FloatArray) -> FloatArray:
         """Return the used rows of a series (m,) or table (m, k), whitened."""
+        if series.ndim == 2:
+            white = np.empty((int(self.rows.sum()), series.shape[1]))
+            kernels.innovations(np.ascontiguousarray(series), self.ar, self.rows, white)
+            return white
         out = series.copy()
         for k, a in enumerate(self.ar, start=1):
             out[k:] -= a * series[:-k]
@@ -245,31 +262,59 @@ def base_mask(task: Task, model: Extended) -> BoolArray:
     return free
 
 
-def _base_steps(model: RegionalModel, size: float) -> FloatArray:
-    """Return steps for differences in the packed parameters, at an output of this size."""
-    j, i = model.pieces, model.regions
-    span = float(model.knots[-1] - model.knots[0])
-    return np.concatenate(
-        [np.full(j + 1, size), np.full(j - 1, 1e-3 * span), np.full(j - 1, size),
-         np.full(i, 0.02), np.full(i, 0.2), np.full(model.size - (3 * j - 1 + 2 * i), size)]
-    )  # fmt: skip
-
-
 def base_tangents(task: Task, model: Extended) -> FloatArray:
-    """Return derivatives of the means by the free parameters of curve and dynamics, (m, P)."""
-    grids = task.grids
+    """Return derivatives of the means by the free parameters of curve and dynamics, (m, P).
+
+    The inputs of the curve and the regions of the rows are kept.
+    """
+    grids, base, regional = task.grids, model.base, model.regional
     driven = drive(grids, model)
-    path = region_path(model, flow_of(model, driven))
-    here = answer(grids, model, driven, path)
-    packed, steps = model.base.pack(), _base_steps(model.base, grids.size)
+    scale, added = driven.scale, np.full(len(driven.u), base.offset)
+    if driven.added is not None:
+        added += driven.added
+    if driven.gain is not None:
+        scale, added = scale * driven.gain, added * driven.gain
+    late = lags_of(model)
+    group = 1 if late else grids.group
+    means = len(driven.u) // group
+    table = np.empty((means, regional.size))
+    nothing = np.zeros(means)
 
-    def column(p: int) -> FloatArray:
+    def stretch(begin: int, first: int, end: int) -> None:
+        tangents(
+            driven.u, scale, added, grids.usable, nothing, regional.knots, regional.left,
+            regional.right, regional.levels, regional.time_constants, regional.delays,
+            grids.step_s, 0, group, begin, first, end, np.empty(end - first), table[first:end],
+            np.empty(end - first, dtype=np.uint8),
+        )  # fmt: skip
+
+    run_in_threads(stretch, stretches(regional, means, group, grids.step_s, 0), cores())
+    free = base_mask(task, model)
+    table = _by_base(table, model).take(np.flatnonzero(free), axis=1)
+    if late:
+        fine = table
+
+        def column(p: int) -> FloatArray:
+            return means_through(grids, late, np.ascontiguousarray(fine[:, p]))
+
+        table = _columns(len(grids.power), column, [(p,) for p in range(table.shape[1])])
+    if base.offset_mw is not None and driven.gain is not None:
+        path = region_path(model, flow_of(model, driven))
+        table[:, -1] = response(grids, model, driven.gain, path)
+    return table
+
+
+def _by_base(table: FloatArray, model: Extended) -> FloatArray:
+    """Return derivatives by the base, from those by the dynamics that causes made of it."""
+    if not model.at(Stage.DYNAMICS):
+        return table
+    here, packed, columns = model.regional.pack(), model.base.pack(), []
+    for p, value in enumerate(packed):
         moved = packed.copy()
-        moved[p] += steps[p]
-        other = replace(model, base=model.base.unpack(moved))
-        return np.asarray((answer(grids, other, driven, path) - here) / steps[p])
-
-    return _columns(len(here), column, [(int(p),) for p in np.flatnonzero(base_mask(task, model))])
+        moved[p] += _SMALL * (1.0 + abs(value))
+        other = replace(model, base=model.base.unpack(moved)).regional.pack()
+        columns.append((other - here) / (moved[p] - value))
+    return np.asarray(table @ np.column_stack(columns))
 
 
 def _columns(

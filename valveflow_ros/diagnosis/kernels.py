@@ -6,9 +6,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from valveflow_ros.curve.regional_model import curve, lag_step, region_of
+from valveflow_ros.curve.regional_model import (
+    TAP_0,
+    TAP_1,
+    TAP_2,
+    TAP_A,
+    TAP_WHOLE,
+    lag_step,
+    region_of,
+)
 from valveflow_ros.numerics import jit
-from valveflow_ros.records import NS_PER_S, ByteArray, FloatArray, IntArray
+from valveflow_ros.records import NS_PER_S, BoolArray, ByteArray, FloatArray, IntArray
 
 
 @jit
@@ -17,8 +25,15 @@ def flow(
     right: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Write x = ``scale`` F(u) + ``offset``, shape (n,)."""
+    k, last = 0, left.size - 1
     for t in range(u.size):
-        out[t] = scale[t] * curve(u[t], knots, left, right) + offset
+        # The piece is mostly that of the row before.
+        while k < last and u[t] >= knots[k + 1]:
+            k += 1
+        while k > 0 and u[t] < knots[k]:
+            k -= 1
+        w = (u[t] - knots[k]) / (knots[k + 1] - knots[k])
+        out[t] = scale[t] * (left[k] + (right[k] - left[k]) * w) + offset
 
 
 @jit
@@ -26,25 +41,6 @@ def regions(x: FloatArray, levels: FloatArray, out: ByteArray) -> None:
     """Write the region of every flow, shape (n,)."""
     for t in range(x.size):
         out[t] = region_of(x[t], levels)
-
-
-@jit
-def respond(
-    x: FloatArray, usable: ByteArray, region: ByteArray, taps: FloatArray, out: FloatArray
-) -> None:
-    """Filter the flow with the taps of the region of each row; a gap starts in equilibrium."""
-    state = 0.0
-    age = 0
-    for t in range(x.size):
-        if not usable[t]:
-            age = 0
-            out[t] = 0.0
-            continue
-        if age == 0:
-            state = x[t]
-        state = lag_step(x, t, age, taps[region[t]], state)
-        out[t] = state
-        age += 1
 
 
 @jit
@@ -56,21 +52,48 @@ def respond_means(
     group: int,
     out: FloatArray,
 ) -> None:
-    """Do the same as `respond`, but write only means over ``group`` rows."""
-    state = 0.0
-    age = 0
+    """Filter the flow with the taps of the region of each row; write means over ``group`` rows.
+
+    A gap starts in equilibrium; its own rows are 0.
+    """
+    state, a, w0, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
+    age, whole, last = 0, 0, -1
     for b in range(out.size):
         total = 0.0
         for t in range(b * group, (b + 1) * group):
             if not usable[t]:
                 age = 0
                 continue
-            if age == 0:
-                state = x[t]
-            state = lag_step(x, t, age, taps[region[t]], state)
+            r = region[t]
+            if r != last:
+                last, whole, a = r, int(taps[r, TAP_WHOLE]), taps[r, TAP_A]
+                w0, w1, w2 = taps[r, TAP_0], taps[r, TAP_1], taps[r, TAP_2]
+            if age >= whole + 2:
+                past = t - whole
+                # What does not need the row before is summed first: the processor can begin early.
+                state = a * state + (w0 * x[past] + w1 * x[past - 1] + w2 * x[past - 2])
+            else:
+                state = lag_step(x, t, age, taps[r], x[t] if age == 0 else state)
             total += state
             age += 1
         out[b] = total / group
+
+
+@jit
+def innovations(table: FloatArray, ar: FloatArray, rows: BoolArray, out: FloatArray) -> None:
+    """Write the rows of ``table``, (m, k), that count, less their prediction by ``ar``."""
+    written = 0
+    for t in range(table.shape[0]):
+        if not rows[t]:
+            continue
+        now, here = out[written], table[t]
+        for j in range(here.size):
+            now[j] = here[j]
+        for lag in range(min(ar.size, t)):
+            a, past = ar[lag], table[t - 1 - lag]
+            for j in range(here.size):
+                now[j] -= a * past[j]
+        written += 1
 
 
 @jit

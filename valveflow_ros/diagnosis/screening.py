@@ -17,7 +17,14 @@ import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Cause, FittedCause, Start, Values
-from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive, flow_of, region_path
+from valveflow_ros.diagnosis.extended import (
+    Extended,
+    answer,
+    drive,
+    flow_of,
+    region_path,
+    response,
+)
 from valveflow_ros.diagnosis.fitting import (
     Task,
     base_mask,
@@ -27,8 +34,8 @@ from valveflow_ros.diagnosis.fitting import (
     level_tangents,
 )
 from valveflow_ros.diagnosis.grids import DAY_S, Grids
-from valveflow_ros.numerics import cores, run_in_threads
-from valveflow_ros.records import FloatArray
+from valveflow_ros.numerics import each_in_threads
+from valveflow_ros.records import ByteArray, FloatArray
 
 # The part that the model itself could explain; it is removed before a cause is judged.
 
@@ -98,32 +105,26 @@ class Screening:
         """Return d power / d (gain, u, offset, curve at the hats), shape (m, 3 + HATS)."""
         grids, model = self.grids, self.model
         driven = drive(grids, model)
-        x = flow_of(model, driven)
-        path = region_path(model, x)
+        x, path = self._flow()
 
         def scaled(factor: float) -> FloatArray:
             return answer(grids, model, replace(driven, u=driven.u * factor))
 
         gain = np.ones(len(x)) if driven.gain is None else driven.gain
         columns = [
-            self._linear(driven, x, path, x),
+            response(grids, model, x, path),
             (scaled(1.0 + _SECANT) - scaled(1.0 - _SECANT)) / (2.0 * _SECANT),
             np.ones(len(self.here)),
         ]
         for k in range(HATS):
             hat = np.interp(driven.u, self.hats, np.eye(HATS)[k])
-            columns.append(self._linear(driven, x, path, hat * gain))
+            columns.append(response(grids, model, hat * gain, path))
         return np.column_stack(columns)
 
-    def _linear(
-        self, driven: Drive, x: FloatArray, path: np.ndarray, change: FloatArray
-    ) -> FloatArray:
-        """Return the response to a small change of the flow, with fixed regions."""
-        gain = 1.0 if driven.gain is None else driven.gain
-        added = change / gain if driven.added is None else driven.added + change / gain
-        moved = answer(self.grids, self.model, replace(driven, added=added), path)
-        held = answer(self.grids, self.model, driven, path)
-        return moved - held
+    def _flow(self) -> tuple[FloatArray, ByteArray]:
+        """Return the steam power x in MW and the region of every model row, (n,)."""
+        x = flow_of(self.model, drive(self.grids, self.model))
+        return x, region_path(self.model, x)
 
     @property
     def sums(self) -> FloatArray:
@@ -211,12 +212,7 @@ class Screening:
 
     def best(self, cause: Cause, grid: list[Values], keep: int = 1) -> list[Start]:
         """Return the starts with the largest gain."""
-        tried = [Start(v, 0.0) for v in grid]
-
-        def work(k: int) -> None:
-            tried[k] = self.displaced(cause, grid[k])
-
-        run_in_threads(work, [(k,) for k in range(len(grid))], cores())
+        tried = each_in_threads(lambda values: self.displaced(cause, values), grid)
         return [s for s in sorted(tried, key=lambda s: -s.gain)[:keep] if s.gain > 0.0]
 
     def scaled(self, cause: Cause, unit: Values) -> list[Start]:
@@ -261,8 +257,11 @@ class Screening:
         The tangents are not removed from the column: over the whole record the curve could explain
         all of the gain, and nothing would remain.
         """
-        p = self.n.shape[1]
-        return self.sums[:, p + GAIN, p + GAIN], self.sums[:, p + GAIN, -1]
+        x, path = self._flow()
+        column = self.task.innovations(response(self.grids, self.model, x, path))
+        sub = self.grids.sub[self.task.rows]
+        own, toward = (np.bincount(sub, column * x, self.grids.subs) for x in (column, self.rest))
+        return np.asarray(own, dtype=np.float64), np.asarray(toward, dtype=np.float64)
 
     def scaled_height(self, cause: Cause, shape: Values) -> Start:
         """Return the start of a cause that is linear in its first parameter."""

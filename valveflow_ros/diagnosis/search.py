@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import FittedCause, Start
+from valveflow_ros.diagnosis.cause import Cause, FittedCause, Start
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive
@@ -28,6 +28,7 @@ from valveflow_ros.diagnosis.screening import EDGE_SHARE, Screening
 from valveflow_ros.errors import TooFewSamplesError, listed
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
+from valveflow_ros.numerics import each_in_threads
 from valveflow_ros.records import FloatArray
 
 # The plain simulation: few distinct pieces.
@@ -519,11 +520,19 @@ def _shortlist(found: SearchResult, barred: set[str]) -> list[tuple[str, Start]]
     before = replace(found.model, base=found.start.base)
     every = causes_for(screening.task.grids)
     single = {a.cause.family for a in screening.model.active} & {'slack'}
-    starts: dict[str, list[Start]] = {}
-    for name, cause in every.items():
-        if not (name in barred or name in screening.model.names or cause.family in single):
-            on = Screening(found.task, before, found.rough) if name == _BEND else screening
-            starts[name] = list(cause.starts(on))
+    wanted = [
+        cause for name, cause in every.items()
+        if not (name in barred or name in screening.model.names or cause.family in single)
+    ]  # fmt: skip
+    screening.sums  # noqa: B018 - once, before several threads need them
+
+    def starts_of(cause: Cause) -> list[Start]:
+        bent = cause.name == _BEND
+        on = Screening(found.task, before, found.rough) if bent else screening
+        return list(cause.starts(on))
+
+    names = [cause.name for cause in wanted]
+    starts = dict(zip(names, each_in_threads(starts_of, wanted), strict=True))
     best = {n: max(s.gain for s in found) for n, found in starts.items() if found}
     if not best or max(best.values()) < SCREEN_LEAST:
         return []
@@ -541,18 +550,22 @@ def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
     tangents = None
     if shortlist:
         tangents = found.task.innovations(base_tangents(found.task, found.model))
-    refits: list[tuple[Extended, float]] = []
-    from_base: dict[str, list[tuple[Extended, float]]] = {}
+    near: list[Extended] = []
+    far: list[Extended] = []
     for name, start in shortlist:
+        base = found.model.base if start.base is None else start.base
         added = FittedCause(every[name], start.values, start.extra)
-        if start.base is None:
-            refits.append(_refit(found.task, found.model.with_cause(added), tangents))
-        else:
-            model = replace(found.model, base=start.base).with_cause(added)
-            from_base.setdefault(name, []).append(improve(found.task, model, 2))
-    for several in from_base.values():
+        (near if start.base is None else far).append(
+            replace(found.model, base=base).with_cause(added)
+        )
+    begun: dict[str, list[tuple[Extended, float]]] = {}
+    for model, cost in each_in_threads(lambda m: improve(found.task, m, 2), far):
+        begun.setdefault(model.names[-1], []).append((model, cost))
+    todo: list[tuple[Extended, FloatArray | None]] = [(model, tangents) for model in near]
+    for several in begun.values():
         best_first = sorted(several, key=lambda m: m[1])
-        refits += [_refit(found.task, model, None) for model, _ in best_first[:_REFITTED]]
+        todo += [(model, None) for model, _ in best_first[:_REFITTED]]
+    refits = each_in_threads(lambda given: _refit(found.task, *given), todo)
     if not refits:
         return []
     # The noise variance is that of the best refit.

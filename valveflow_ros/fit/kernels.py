@@ -292,7 +292,7 @@ def _fill(
 def tangents(
     u: FloatArray,
     scale: FloatArray,
-    offset: float,
+    added: FloatArray,
     usable: ByteArray,
     power: FloatArray,
     knots: FloatArray,
@@ -315,8 +315,10 @@ def tangents(
 
     Parameters
     ----------
-    u, scale, offset, usable, power, settle, group, begin
+    u, scale, usable, power, settle, group, begin
         As for `answer_residual`.
+    added : (n,)
+        The flow is ``scale`` F(u) + ``added``.
     knots : (J + 1,); left, right : (J,)
     levels : (I - 1,); time_constants, delays : (I,) seconds
     residual, weight : (end - first,)
@@ -348,7 +350,8 @@ def tangents(
             u[row + t : row + t + n], knots, left, right,
             flow[t : t + n], share[t : t + n], piece[t : t + n],
         )  # fmt: skip
-        scale_flow(flow[t : t + n], scale[row + t : row + t + n], offset)
+        for i in range(t, t + n):
+            flow[i] = scale[row + i] * flow[i] + added[row + i]
         region_of_each(flow[t : t + n], usable[row + t : row + t + n], levels, region[:n])
         state, age = _fill(
             flow, scale[row : row + rows], share, piece, t, region[:n],

@@ -196,11 +196,12 @@ class Problem:
         residual = np.empty(s.means)
         jacobian = np.empty((s.means, model.size + also))
         weight = np.empty(s.means, dtype=np.uint8)
+        added = np.full(len(self.u), model.offset)
 
         def stretch(begin: int, first: int, end: int) -> None:
             part = slice(first, end)
             self._tangents(
-                model, begin, first, end, residual[part], jacobian[part], weight[part]
+                model, added, begin, first, end, residual[part], jacobian[part], weight[part]
             )  # fmt: skip
 
         run_in_threads(stretch, self._stretches(model), self._threads)
@@ -216,31 +217,32 @@ class Problem:
         rows : int
         """
         order, columns = len(ar), model.size
-        stretches = self._stretches(model, order)
-        sums = np.zeros((len(stretches), columns + 1, columns + 1))
-        rows = np.zeros(len(stretches), dtype=np.int64)
+        parts = self._stretches(model, also=order)
+        added = np.full(len(self.u), model.offset)
+        sums = np.zeros((len(parts), columns + 1, columns + 1))
+        rows = np.zeros(len(parts), dtype=np.int64)
 
         def stretch(k: int, begin: int, first: int, end: int) -> None:
             back = min(first, order)
             n = end - first + back
             residual, jacobian = np.empty(n), np.empty((n, columns))
             weight = np.empty(n, dtype=np.uint8)
-            self._tangents(model, begin, first - back, end, residual, jacobian, weight)
+            self._tangents(model, added, begin, first - back, end, residual, jacobian, weight)
             rows[k] = normal_sums(
                 jacobian, residual, weight, ar, back, n, sums[k], np.empty((0, columns))
             )  # fmt: skip
 
-        run_in_threads(stretch, [(k, *part) for k, part in enumerate(stretches)], self._threads)
+        run_in_threads(stretch, [(k, *part) for k, part in enumerate(parts)], self._threads)
         total = np.tril(sums.sum(axis=0))
         return total + np.tril(total, -1).T, int(rows.sum())
 
     def _tangents(
-        self, model: RegionalModel, begin: int, first: int, end: int,
+        self, model: RegionalModel, added: FloatArray, begin: int, first: int, end: int,
         residual: FloatArray, jacobian: FloatArray, weight: ByteArray,
     ) -> None:  # fmt: skip
         s = self.samples
         tangents(
-            self.u, self.scale, model.offset, self.usable, self.power,
+            self.u, self.scale, added, self.usable, self.power,
             model.knots, model.left, model.right, model.levels,
             model.time_constants, model.delays, s.step_s, self.settle, s.group,
             begin, first, end, residual, jacobian, weight,
@@ -261,18 +263,23 @@ class Problem:
         cost, rows = square_sum(residual, weight, ar)
         return float(cost), int(rows)
 
-    def _stretches(
-        self, model: RegionalModel, also: int = 0, least: int = 0
-    ) -> list[tuple[int, int, int]]:
-        """Divide the means into stretches: start of the filters, first mean to use, end.
-
-        ``also`` means before the first are correct, too; a stretch has at least ``least`` means.
-        """
+    def _stretches(self, model: RegionalModel, **need: int) -> list[tuple[int, int, int]]:
         s = self.samples
-        memory_s = _FORGOTTEN * float(model.time_constants.max()) + float(model.delays.max())
-        lead = math.ceil((memory_s / s.step_s + self.settle + 3) / s.group) + also
-        length = max(_STRETCH, 8 * lead, least)
-        return [(max(0, first - lead), first, end) for first, end in runs(s.means, length)]
+        return stretches(model, s.means, s.group, s.step_s, self.settle, **need)
+
+
+def stretches(
+    model: RegionalModel, means: int, group: int, step_s: float, settle: int, *, also: int = 0,
+    least: int = 0,
+) -> list[tuple[int, int, int]]:  # fmt: skip
+    """Divide means over ``group`` rows into stretches: start of the filters, first mean, end.
+
+    ``also`` means before the first are correct, too; a stretch has at least ``least`` means.
+    """
+    memory_s = _FORGOTTEN * float(model.time_constants.max()) + float(model.delays.max())
+    lead = math.ceil((memory_s / step_s + settle + 3) / group) + also
+    length = max(_STRETCH, 8 * lead, least)
+    return [(max(0, first - lead), first, end) for first, end in runs(means, length)]
 
 
 def free_parameters(model: RegionalModel, jumps: BoolArray | None = None) -> BoolArray:

@@ -102,7 +102,7 @@ def apply_reheater(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
     alpha, time_s = values
     taps = make_taps(np.array([time_s]), np.zeros(1), grids.step_s)
     late = np.empty(len(y))
-    kernels.respond(y, grids.usable, np.zeros(len(y), dtype=np.uint8), taps, late)
+    kernels.respond_means(y, grids.usable, np.zeros(len(y), dtype=np.uint8), taps, 1, late)
     return np.asarray(alpha * y + (1.0 - alpha) * late)
 
 
