@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from valveflow_ros.curve.regional_model import RegionalModel
-from valveflow_ros.diagnosis.cause import Cause, FittedCause, Start
+from valveflow_ros.diagnosis.cause import FittedCause, Start
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import Evidence, colour, weigh
 from valveflow_ros.diagnosis.extended import Drive, Extended, answer, drive
@@ -161,6 +161,16 @@ class Rival:
 
 
 @dataclass(slots=True)
+class Trials:
+    """The starts and refits of causes added to one model, by name: none is computed twice."""
+
+    task: Task
+    model: Extended
+    starts: dict[str, list[Start]] = field(default_factory=dict)
+    refits: dict[str, list[tuple[Extended, float]]] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
 class SearchResult:
     """The outcome of the search.
 
@@ -186,6 +196,8 @@ class SearchResult:
         Sentence on a change in time that fits a little better than the named one; or ''.
     refuted : set of str
         Causes that the sealed blocks did not confirm.
+    trials : Trials, optional
+        Of the last model to which causes were added.
     """
 
     task: Task
@@ -199,6 +211,7 @@ class SearchResult:
     rough: Grids | None = None
     other_shape: str = ''
     refuted: set[str] = field(default_factory=set)
+    trials: Trials | None = None
 
     def withdraw(self, name: str, why: str, model: Extended | None = None) -> None:
         """Remove a cause; ``model`` is the one without it, which is fitted here if not given."""
@@ -288,6 +301,7 @@ def _extended(
         _exchange(found, barred)
         _conceal(found, barred)
         if _INTERVALS in found.model.names and _INTERVALS not in before.model.names:
+            before.trials = found.trials
             others = _extended(before, barred_before, progress, pairs=True)
             return _likelier(_extended(found, barred, progress), others)
     return found
@@ -510,62 +524,70 @@ def _absorb(found: SearchResult, rival: Rival) -> None:
     found.plain, _ = improve(found.task, plain, 4)
 
 
-def _shortlist(found: SearchResult, barred: set[str]) -> list[tuple[str, Start]]:
-    """Return starts to be refitted: the best ones, and the families of the best ones.
+def _shortlist(found: SearchResult, barred: set[str], known: dict[str, list[Start]]) -> list[str]:
+    """Return causes to be refitted: the best ones, and the families of the best ones.
 
     Backlash and stiction are two models of one slack: there is one of them only. The fitted curve
     has moved its breakpoints towards a bend, so a bend is searched for on the curve before.
     """
-    screening = Screening(found.task, found.model, found.rough)
-    before = replace(found.model, base=found.start.base)
-    every = causes_for(screening.task.grids)
-    single = {a.cause.family for a in screening.model.active} & {'slack'}
+    task, model = found.task, found.model
+    every = causes_for(task.grids)
+    single = {a.cause.family for a in model.active} & {'slack'}
     wanted = [
-        cause for name, cause in every.items()
-        if not (name in barred or name in screening.model.names or cause.family in single)
+        name for name, cause in every.items()
+        if not (name in barred or name in model.names or cause.family in single)
     ]  # fmt: skip
-    screening.sums  # noqa: B018 - once, before several threads need them
+    if untried := [name for name in wanted if name not in known]:
+        screening = Screening(task, model, found.rough)
+        before = replace(model, base=found.start.base)
+        screening.sums  # noqa: B018 - once, before several threads need them
 
-    def starts_of(cause: Cause) -> list[Start]:
-        bent = cause.name == _BEND
-        on = Screening(found.task, before, found.rough) if bent else screening
-        return list(cause.starts(on))
+        def starts_of(name: str) -> list[Start]:
+            on = Screening(task, before, found.rough) if name == _BEND else screening
+            return list(every[name].starts(on))
 
-    names = [cause.name for cause in wanted]
-    starts = dict(zip(names, each_in_threads(starts_of, wanted), strict=True))
-    best = {n: max(s.gain for s in found) for n, found in starts.items() if found}
+        known |= zip(untried, each_in_threads(starts_of, untried), strict=True)
+    best = {name: max(s.gain for s in known[name]) for name in wanted if known[name]}
     if not best or max(best.values()) < SCREEN_LEAST:
         return []
     least = max(SCREEN_LEAST, SCREEN_SHARE * max(best.values()))
     good = sorted((n for n in best if best[n] >= least), key=lambda n: -best[n])[:MOST_RIVALS]
     families = {every[n].family for n in good}
-    good += [n for n in best if n not in good and every[n].family in families]
-    return [(n, s) for n in good for s in starts[n]]
+    return good + [n for n in best if n not in good and every[n].family in families]
 
 
-def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
-    """Refit every promising cause; return one candidate per cause, best score first."""
-    shortlist = _shortlist(found, barred)
-    every = causes_for(found.task.grids)
-    tangents = None
-    if shortlist:
-        tangents = found.task.innovations(base_tangents(found.task, found.model))
+def _refitted(trials: Trials, names: list[str]) -> list[tuple[Extended, float]]:
+    """Return the models with one of these causes each, and their sums of squares."""
+    task, refits = trials.task, trials.refits
+    every, untried = causes_for(task.grids), [name for name in names if name not in refits]
     near: list[Extended] = []
     far: list[Extended] = []
-    for name, start in shortlist:
-        base = found.model.base if start.base is None else start.base
+    for name, start in ((n, s) for n in untried for s in trials.starts[n]):
+        base = trials.model.base if start.base is None else start.base
         added = FittedCause(every[name], start.values, start.extra)
         (near if start.base is None else far).append(
-            replace(found.model, base=base).with_cause(added)
+            replace(trials.model, base=base).with_cause(added)
         )
     begun: dict[str, list[tuple[Extended, float]]] = {}
-    for model, cost in each_in_threads(lambda m: improve(found.task, m, 2), far):
+    for model, cost in each_in_threads(lambda m: improve(task, m, 2), far):
         begun.setdefault(model.names[-1], []).append((model, cost))
+    tangents = task.innovations(base_tangents(task, trials.model)) if near else None
     todo: list[tuple[Extended, FloatArray | None]] = [(model, tangents) for model in near]
     for several in begun.values():
         best_first = sorted(several, key=lambda m: m[1])
         todo += [(model, None) for model, _ in best_first[:_REFITTED]]
-    refits = each_in_threads(lambda given: _refit(found.task, *given), todo)
+    refits |= {name: [] for name in untried}
+    for model, cost in each_in_threads(lambda given: _refit(task, *given), todo):
+        refits[model.names[-1]].append((model, cost))
+    return [refit for name in names for refit in refits[name]]
+
+
+def _rivals(found: SearchResult, barred: set[str]) -> list[Rival]:
+    """Refit every promising cause; return one candidate per cause, best score first."""
+    trials = found.trials
+    if trials is None or trials.task is not found.task or trials.model is not found.model:
+        trials = found.trials = Trials(found.task, found.model)
+    refits = _refitted(trials, _shortlist(found, barred, trials.starts))
     if not refits:
         return []
     # The noise variance is that of the best refit.
