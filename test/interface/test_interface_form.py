@@ -177,11 +177,13 @@ def test_a_breakpoint_that_only_long_means_show_is_found():
     assert any('fast movements would give another curve' in note for note in curve.notes)
 
 
-def test_where_neither_decides_the_likelier_form_of_all_rows_is_taken():
-    simulation = vf.simulate(8.0, 2335, unit='sequence:number=2335', recording='minute')
+@pytest.mark.parametrize('seed', [2335, 93004])
+def test_where_neither_decides_the_likelier_form_of_all_rows_is_taken(seed):
+    unit = f'sequence:number={seed}'
+    simulation = vf.simulate(8.0, seed, unit=unit, recording='minute')
     curve = vf.identify(simulation.log).characteristic
     assert (curve.axis, curve.form.told) == (OPENING, False)
-    assert error_mw(simulation, curve) < 1.0  # 3.9 MW in the other form
+    assert error_mw(simulation, curve) < 1.0  # 3.9 and 2.7 MW in the other form
 
 
 def test_a_model_of_the_wrong_form_is_the_first_finding_and_one_of_the_right_form_none(tmp_path):

@@ -159,16 +159,24 @@ def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
 
 
 def _chances(found: SearchResult) -> list[float]:
-    """Return the chance of a gain as large on sealed blocks, of each cause beside the others."""
+    """Return the chance of a gain as large on sealed blocks, of each cause beside the others.
+
+    The smallest chance counts all causes, the next one those that are left, the largest none but
+    itself (Holm, Scand. J. Stat. 6, 1979): together they keep the level of one test.
+    """
     task, model = found.task, found.model
     unsure = while_unsure(task, model)
 
     def chance(a: FittedCause) -> float:
         without, _ = improve(task, model.without(a.name), 3)
-        tested = len(model.active)
-        return sealed_gain(task, without, model, found.tried, tested, unsure).p_value
+        return sealed_gain(task, without, model, found.tried, unsure=unsure).p_value
 
-    return each_in_threads(chance, model.active)
+    single = np.array(each_in_threads(chance, model.active))
+    order = np.argsort(single)
+    factors = len(single) - np.arange(len(single))
+    together = np.empty(len(single))
+    together[order] = np.minimum(np.maximum.accumulate(factors * single[order]), 1.0)
+    return together.tolist()
 
 
 # Causes found without the model of the unit: in the actuator and in the record.

@@ -24,7 +24,7 @@ from valveflow_ros.diagnosis.slow import Levels, Regression, half_hours, regress
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
-LEAST_GAIN, LEAST_SIGN, LEAST_MW2 = 14.0, 3.0, 0.02
+LEAST_GAIN, LEAST_SIGN, LEAST_MW2 = 12.0, 2.0, 0.02
 _MINUTE_S = 60.0
 _FINE, _MEDIUM, _COARSE, _TRIPLE, _RIPPLE = 24, 8, 4, 4, 48
 _SHRINK = (4.0, 30.0)

@@ -49,11 +49,10 @@ _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 # A searched exponent gains by chance over the given one: of 42 random plants with the given
 # exponent, one seemed to have another, with a gain of 15.
 _EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
-# If undecided, the form over V is used if its gain exceeds this many standard errors.
+# If undecided, the form over V is used if its gain exceeds this many standard errors, or if the
+# exponent of the paper's form is at an end of its range. It is there in units of the other form
+# only: set after a look at the units 2335, 1306 and 93004 of `benchmarks.thermal_study`.
 _LIKELIER_Z = 1.5
-# The same if the exponent of the paper's form is at an end of its range, as it is in units of the
-# other form only: set after a look at the units 2335 and 1306 of `benchmarks.thermal_study`.
-_DOUBTFUL_Z = 0.75
 _CHOKED_EXPONENT = 1.0
 _WORST = 0.05
 _LEAST_IN_CELL, _EIGHTHS = 5, 8
@@ -166,7 +165,7 @@ def find_form(
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
     doubtful = paper.form.exponent != exponent and _at_end(paper, within)
-    takes_scaled = gain > _LEAST_GAIN and sure > (_DOUBTFUL_Z if doubtful else _LIKELIER_Z)
+    takes_scaled = gain > _LEAST_GAIN and (doubtful or sure > _LIKELIER_Z)
     if known is not None and known.scaled:
         takes_scaled = not _told(means, paper, scaled)[2]
     if held is not None:
