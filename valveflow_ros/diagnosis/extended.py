@@ -197,7 +197,10 @@ def _shown(
 
 
 def means_through(grids: Grids, causes: list[FittedCause], y: FloatArray) -> FloatArray:
-    """Return the means, (m,), of a power y, (n,), after causes that change it."""
+    """Return the means, (m,), of a power y, (n,), after causes that change it.
+
+    Causes that delay the power also work on a table, (n, k).
+    """
     for a in causes:
         y = a.cause.act(y, a.values, grids)
     return grids.means(y)

@@ -289,15 +289,9 @@ def base_tangents(task: Task, model: Extended) -> FloatArray:
         )  # fmt: skip
 
     run_in_threads(stretch, stretches(regional, means, group, grids.step_s, 0), cores())
-    free = base_mask(task, model)
-    table = _by_base(table, model).take(np.flatnonzero(free), axis=1)
     if late:
-        fine = table
-
-        def column(p: int) -> FloatArray:
-            return means_through(grids, late, np.ascontiguousarray(fine[:, p]))
-
-        table = _columns(len(grids.power), column, [(p,) for p in range(table.shape[1])])
+        table = means_through(grids, late, table)
+    table = _by_base(table, model).take(np.flatnonzero(base_mask(task, model)), axis=1)
     if base.offset_mw is not None and driven.gain is not None:
         path = region_path(model, flow_of(model, driven))
         table[:, -1] = response(grids, model, driven.gain, path)

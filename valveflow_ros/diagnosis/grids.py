@@ -272,7 +272,9 @@ class Grids:
         return np.asarray(np.mod(time_s + first, DAY_S))
 
     def means(self, rows: FloatArray) -> FloatArray:
-        """Return means of model rows over the scored means, (n,) to (m,)."""
+        """Return means of model rows over the scored means, (n,) to (m,) or (n, k) to (m, k)."""
+        if rows.ndim == 2:
+            return np.asarray(rows.reshape(-1, self.group, rows.shape[1]).mean(axis=1))
         out = np.empty(len(self.power))
         kernels.means(rows, self.group, out)
         return out

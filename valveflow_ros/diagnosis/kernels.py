@@ -11,6 +11,8 @@ from valveflow_ros.curve.regional_model import (
     TAP_1,
     TAP_2,
     TAP_A,
+    TAP_B,
+    TAP_C,
     TAP_WHOLE,
     lag_step,
     region_of,
@@ -77,6 +79,39 @@ def respond_means(
             total += state
             age += 1
         out[b] = total / group
+
+
+@jit
+def reheated(
+    y: FloatArray, usable: ByteArray, alpha: float, tap: FloatArray, out: FloatArray
+) -> None:
+    """Write ``alpha`` y plus the rest of y after a lag, (n,); a gap starts in equilibrium."""
+    a, b, c = tap[TAP_A], tap[TAP_B], tap[TAP_C]
+    state, begun = 0.0, False
+    for t in range(y.size):
+        if not usable[t]:
+            begun, out[t] = False, 0.0
+            continue
+        state = a * state + (c * y[t] + b * y[t - 1]) if begun else y[t]
+        begun, out[t] = True, alpha * y[t] + (1.0 - alpha) * state
+
+
+@jit
+def reheated_table(
+    table: FloatArray, usable: ByteArray, alpha: float, tap: FloatArray, out: FloatArray
+) -> None:
+    """Do the same with all columns of a table, (n, k)."""
+    a, b, c = tap[TAP_A], tap[TAP_B], tap[TAP_C]
+    state, begun = np.zeros(table.shape[1]), False
+    for t in range(table.shape[0]):
+        if not usable[t]:
+            begun, out[t] = False, 0.0
+            continue
+        now, before, new = table[t], table[t - 1], out[t]
+        for j in range(now.size):
+            state[j] = a * state[j] + (c * now[j] + b * before[j]) if begun else now[j]
+            new[j] = alpha * now[j] + (1.0 - alpha) * state[j]
+        begun = True
 
 
 @jit

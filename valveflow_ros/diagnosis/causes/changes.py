@@ -279,12 +279,14 @@ def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
     Viterbi algorithm on sums over half hours.
     """
     # Return the factor on x; ``extra`` holds the switching times in seconds.
-    inside = np.searchsorted(np.asarray(extra), grids.time_s, side='right') % 2
-    # Relative to the mean over the record, as for a drift.
     span = grids.reference.span_s
-    edges = np.clip(np.append(np.asarray(extra), span if len(extra) % 2 else []), 0.0, span)
-    share = float(np.sum(edges[1::2] - edges[::2])) / span
-    return np.asarray(1.0 + values[0] * (inside - share))
+    edges = np.append(np.asarray(extra), span if len(extra) % 2 else []).reshape(-1, 2)
+    # Relative to the mean over the record, as for a drift.
+    share = float(np.sum(np.diff(np.clip(edges, 0.0, span)))) / span
+    out = np.full(len(grids.time_s), 1.0 - values[0] * share)
+    for a, b in np.searchsorted(grids.time_s, edges).tolist():
+        out[a:b] = 1.0 + values[0] * (1.0 - share)
+    return out
 
 
 def intervals_starts(screening: Screening) -> Sequence[Start]:

@@ -100,10 +100,11 @@ def apply_reheater(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
         y = alpha y1 + (1 - alpha) y1 / (1 + T s),  y1 = G x
     """
     alpha, time_s = values
-    taps = make_taps(np.array([time_s]), np.zeros(1), grids.step_s)
-    late = np.empty(len(y))
-    kernels.respond_means(y, grids.usable, np.zeros(len(y), dtype=np.uint8), taps, 1, late)
-    return np.asarray(alpha * y + (1.0 - alpha) * late)
+    (tap,) = make_taps(np.array([time_s]), np.zeros(1), grids.step_s)
+    out = np.empty_like(y)
+    work = kernels.reheated if y.ndim == 1 else kernels.reheated_table
+    work(y, grids.usable, alpha, tap, out)
+    return out
 
 
 def reheater_starts(screening: Screening) -> Sequence[Start]:
@@ -168,12 +169,13 @@ def apply_clock(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
     stamped too early only the part beyond the shortest delay is visible: ``d_s`` is that part, and
     the upper end of its interval is raised by the longest possible delay of a unit.
     """
-    late = values[0] / grids.step_s
-    whole = int(np.floor(late))
-    part = late - whole
-    at = np.minimum(np.arange(len(y)) + whole, len(y) - 1)
-    after = np.minimum(at + 1, len(y) - 1)
-    return np.asarray(y[at] * (1.0 - part) + y[after] * part)
+    part, whole = np.modf(values[0] / grids.step_s)
+
+    def ahead(rows: int) -> FloatArray:
+        rows = min(rows, len(y))
+        return np.concatenate([y[rows:], np.repeat(y[-1:], rows, axis=0)])
+
+    return np.asarray((1.0 - part) * ahead(int(whole)) + part * ahead(int(whole) + 1))
 
 
 def clock_starts(screening: Screening) -> Sequence[Start]:
