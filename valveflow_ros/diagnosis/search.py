@@ -365,7 +365,6 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
             # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
             continue
-        best = rival.score if best is None else best
         without, cost = improve(found.task, rival.model.without(rival.added.name), 3)
         now = found.task.cost(found.model)
         if cost < now * _SAME_COST:
@@ -377,6 +376,8 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
         evidence = weigh(found.task, without, rival.model, rival.added.size)
         if not evidence.enough:
             found.reasons[rival.added.name] = evidence.reason()
+            if best is None and rival.added.name != _INTERVALS:  # these imitate several causes
+                best = rival.score
             continue
         _note(found, rival, rivals, evidence)
         if rival.added.cause.of_model and not found.task.fixed_dynamics:
