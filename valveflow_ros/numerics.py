@@ -146,6 +146,8 @@ def copied(function: _Function) -> _Function:
 
 T = TypeVar('T')
 R = TypeVar('R')
+_helping, _helpers = threading.Lock(), [0]  # threads that help now
+_FEW = 4
 _END = object()
 # Interval at which a thread that waits for space checks if it must stop.
 _LOOK_S = 0.2
@@ -172,6 +174,7 @@ def run_in_threads(
 ) -> None:
     """Call ``work(*task)`` for every task, on ``threads`` threads; 1 starts none.
 
+    Tasks may call it too: all calls together start ``threads`` - 1 threads at most.
     In contrast to numba's parallel loops this can be used in several threads of a
     process at the same time, starts in microseconds, and creates no thread pool
     that a fork would break. An error of a task is raised here after all threads
@@ -193,9 +196,15 @@ def run_in_threads(
             except BaseException as error:  # noqa: BLE001 - raised again below
                 errors.append(error)
 
-    helpers = [
-        threading.Thread(target=loop, daemon=True) for _ in range(min(threads, len(waiting)) - 1)
-    ]
+    def help_out() -> None:
+        loop()
+        with _helping:
+            _helpers[0] -= 1
+
+    with _helping:
+        count = max(0, min(threads - 1 - _helpers[0], len(waiting) - 1))
+        _helpers[0] += count
+    helpers = [threading.Thread(target=help_out, daemon=True) for _ in range(count)]
     for helper in helpers:
         helper.start()
     loop()
@@ -206,13 +215,13 @@ def run_in_threads(
 
 
 def each_in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
-    """Return ``work(item)`` of every item, computed in as many threads as there are cores."""
+    """Return ``work(item)`` of every item, computed in a few threads: each needs much memory."""
     found: list[Any] = [None] * len(items)
 
     def one(k: int) -> None:
         found[k] = work(items[k])
 
-    run_in_threads(one, [(k,) for k in range(len(items))], cores())
+    run_in_threads(one, [(k,) for k in range(len(items))], min(_FEW, cores()))
     return found
 
 

@@ -18,11 +18,19 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from streams import needs_jit
 
+from valveflow_ros.curve.regional_model import respond
 from valveflow_ros.diagnosis import kernels, record_faults, search
 from valveflow_ros.diagnosis.cause import FittedCause, SentenceValues, Stage
 from valveflow_ros.diagnosis.causes import catalogue, causes_for
 from valveflow_ros.diagnosis.evidence import chance_of_gain
-from valveflow_ros.diagnosis.extended import Extended, ExtendedModel, answer
+from valveflow_ros.diagnosis.extended import (
+    Extended,
+    ExtendedModel,
+    answer,
+    drive,
+    flow_of,
+    region_path,
+)
 from valveflow_ros.diagnosis.fitting import (
     Task,
     base_mask,
@@ -156,27 +164,41 @@ def test_places_on_the_curve_are_in_the_unit_of_its_axis(grids, name):
 
 @pytest.mark.parametrize(
     'causes',
-    [{}, {'reheater': (0.5, 12.0)}, {'clock': (3.0,)}, {'gain_step': (0.1, 0.5), 'curve_shape':
-     (2.0, 50.0, 10.0)}, {'region_lag': (40.0, 6.0, 300.0), 'output_offset_drift': (5.0,)}],
+    [
+        {}, {'reheater': (0.5, 12.0)}, {'clock': (3.0,), 'reheater': (0.3, 20.0)},
+        {'gain_step': (0.1, 0.2), 'curve_shape': (2.0, 1450.0, 200.0)},
+        {'region_lag': (40.0, 6.0, 150.0), 'output_offset_drift': (5.0,)},
+    ],
     ids=lambda causes: '+'.join(causes) or 'none',
 )  # fmt: skip
-def test_tangents_of_the_curve_predict_small_changes(grids, causes):
-    known = causes_for(grids)
+def test_tangents_of_curve_and_dynamics_are_those_of_central_differences(grids, causes):
+    usable = grids.usable.copy()
+    usable[3000:3020] = usable[9001] = 0
+    grids, known = replace(grids, usable=usable, cache={}), causes_for(grids)
+    base = rough_model()
     base = replace(
-        rough_model(), levels=np.empty(0), time_constants=np.array([20.0]),
-        delays=np.array([4.0]), offset_mw=3.0,
+        base, left=base.left + np.append(0.0, np.full(base.pieces - 1, 4.0)),  # with jumps
+        delays=np.array([2.7, 12.4]), offset_mw=3.0,
     )  # fmt: skip
     model = Extended(base, tuple(FittedCause(known[n], v) for n, v in causes.items()))
     task = Task(grids, grids.whole, np.zeros(ORDER))
-    free = np.flatnonzero(base_mask(task, model))
-    columns = base_tangents(task, model)
-    packed = model.base.pack()
-    rng = np.random.default_rng(3)
-    step = rng.normal(size=len(free)) * np.where(free < 5, 0.1, 0.01)
-    packed[free] += step
-    change = answer(grids, replace(model, base=model.base.unpack(packed))) - answer(grids, model)
-    rows = grids.scored
-    assert np.abs(change - columns @ step)[rows].max() < 0.05 * np.abs(change)[rows].max() + 1e-3
+    columns, packed = base_tangents(task, model), base.pack()
+    driven = drive(grids, model)
+    path = region_path(model, flow_of(model, driven))
+    inner = slice(base.pieces + 1, 2 * base.pieces)
+    whole = usable.reshape(-1, grids.group).all(axis=1)
+    for column, p in zip(columns.T, np.flatnonzero(base_mask(task, model)), strict=True):
+        knot = inner.start <= p < inner.stop
+        by = 1e-3 * np.ptp(base.knots) if knot else 1e-5 * (1.0 + abs(packed[p]))
+        ends = []
+        for sign in (1.0, 0.0) if knot else (1.0, -1.0):
+            moved = packed.copy()
+            moved[p] += sign * by
+            moved = replace(model, base=base.unpack(moved))
+            ends.append(answer(grids, moved, driven, path))
+        true = (ends[0] - ends[1]) / (by if knot else 2.0 * by)
+        near = pytest.approx(true[whole], rel=1e-4, abs=1e-4 * np.abs(true).max())
+        assert column[whole] == near
 
 
 def naive_play(v, half):
@@ -243,14 +265,15 @@ def test_a_wander_is_whitened_as_by_its_dense_covariance(gaps_h, scale_h, ratio,
     assert level == pytest.approx(np.log(np.diag(factor)).sum(), rel=1e-8, abs=1e-8)
 
 
-def test_one_pass_and_two_passes_of_the_filter_agree(grids):
+def test_means_are_those_of_the_filter_of_single_rows(grids):
     x = rough_model().static(grids.u)
     path = np.zeros(len(x), dtype=np.uint8)
     taps = rough_model().taps(grids.step_s)
     usable = grids.usable.copy()
     usable[1000:1010] = 0
     rows, means = np.empty(len(x)), np.empty(len(grids.power))
-    kernels.respond_means(x, usable, path, taps, 1, rows)
+    respond(x, usable, np.empty(0), taps, 0, rows, usable.copy())
+    rows[usable == 0] = 0.0
     kernels.respond_means(x, usable, path, taps, grids.group, means)
     np.testing.assert_allclose(means, grids.means(rows), rtol=1e-12)
 

@@ -20,6 +20,7 @@ from valveflow_ros.diagnosis.evidence import (
     Certainty,
     Gain,
     by_segment,
+    chances_over,
     gain_of_form,
     inferred,
     more_or_less,
@@ -27,7 +28,6 @@ from valveflow_ros.diagnosis.evidence import (
     rmse,
     sealed_gain,
     where_largest,
-    while_unsure,
 )
 from valveflow_ros.diagnosis.extended import Extended, answer
 from valveflow_ros.diagnosis.fitting import (
@@ -96,14 +96,14 @@ def confirm(found: SearchResult) -> None:
     """
     while found.model.active:
         chances = _chances(found)
-        worst = max(range(len(chances)), key=lambda k: chances[k])
-        if chances[worst] <= LARGEST_P:
+        worst = max(chances)
+        if worst[0] <= LARGEST_P:
             return
-        name = found.model.active[worst].name
+        name = found.model.active[chances.index(worst)].name
         found.refuted.add(name)
         why = (
             'blocks of time that were kept out of the search do not confirm it (a gain as large '
-            f'there has a chance of {chances[worst]:.2g})'
+            f'there has a chance of {worst[0]:.2g})'
         )
         if not _confirmed_instead(found, name, why):
             found.withdraw(name, why)
@@ -154,29 +154,27 @@ def gains_of(found: SearchResult, models: list[Extended]) -> list[Gain]:
     if len(gains) < 2:
         return gains
     return [
-        replace(gain, p_value=chance) for gain, chance in zip(gains, _chances(found), strict=True)
+        replace(gain, p_value=chance)
+        for gain, (chance, _) in zip(gains, _chances(found), strict=True)
     ]
 
 
-def _chances(found: SearchResult) -> list[float]:
+def _chances(found: SearchResult) -> list[tuple[float, float]]:
     """Return the chance of a gain as large on sealed blocks, of each cause beside the others.
 
-    The smallest chance counts all causes, the next one those that are left, the largest none but
-    itself (Holm, Scand. J. Stat. 6, 1979): together they keep the level of one test.
+    All causes that were tested there count for the smallest chance, one less for the next, and so
+    on (Holm, Scand. J. Stat. 6, 1979); refuted ones come last. The second number of each cause is
+    its chance alone: of equal chances the larger one is the least likely cause.
     """
     task, model = found.task, found.model
-    unsure = while_unsure(task, model)
-
-    def chance(a: FittedCause) -> float:
-        without, _ = improve(task, model.without(a.name), 3)
-        return sealed_gain(task, without, model, found.tried, unsure=unsure).p_value
-
-    single = np.array(each_in_threads(chance, model.active))
-    order = np.argsort(single)
-    factors = len(single) - np.arange(len(single))
-    together = np.empty(len(single))
-    together[order] = np.minimum(np.maximum.accumulate(factors * single[order]), 1.0)
-    return together.tolist()
+    without = each_in_threads(lambda a: improve(task, model.without(a.name), 3)[0], model.active)
+    most = len(model.active) + len(found.refuted)
+    table = chances_over(task, without, model, found.tried, most)
+    order = np.argsort(table[:, 0])
+    counted = table[order, most - 1 - np.arange(len(order))]
+    together = np.empty(len(order))
+    together[order] = np.maximum.accumulate(counted)
+    return list(zip(together.tolist(), table[:, 0].tolist(), strict=True))
 
 
 # Causes found without the model of the unit: in the actuator and in the record.

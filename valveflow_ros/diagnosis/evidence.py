@@ -290,32 +290,56 @@ def rmse(task: Task, model: Extended, rows: BoolArray) -> float:
 
 
 def sealed_gain(
-    task: Task, before: Extended, after: Extended, tried: int, tested: int = 1,
-    unsure: BoolArray | None = None,
-) -> Gain:  # fmt: skip
+    task: Task, before: Extended, after: Extended, tried: int, tested: int = 1
+) -> Gain:
     """Compare two models, both fitted to the open blocks, on the sealed ones.
-
-    Times at which the onset may lie according to the open blocks do not count in the test: there
-    the models cannot know whether the change has happened.
 
     Parameters
     ----------
     tried, tested : int
         Number of causes tried on the open blocks and tested on the sealed ones.
-    unsure : bool (m,), optional
-        Result of `while_unsure` for ``after``, if already known.
     """
     rows = task.grids.sealed_rows
-    told = rows & ~(while_unsure(task, after) if unsure is None else unsure)
-    enough = len(np.unique(task.grids.sub[told])) >= _LEAST_PARTS
-    sealed = replace(task, rows=told if enough else rows)
     old, new = fair_residual(task, before), fair_residual(task, after)
-    rests = sealed.innovations(old), sealed.innovations(new)
-    chance = chance_of_gain(*rests, task.grids.sub[sealed.rows], tried, tested)
-    return Gain(rmse(task, before, rows), rmse(task, after, rows), chance)
+    rests = _told_rests(task, old, new, _while_unsure(task, after))
+    sizes = [float(np.sqrt(np.mean(rest[rows] ** 2))) for rest in (old, new)]
+    return Gain(sizes[0], sizes[1], chance_of_gain(*rests, tried, tested))
 
 
-def while_unsure(task: Task, model: Extended) -> BoolArray:
+def chances_over(
+    task: Task, smaller: list[Extended], model: Extended, tried: int, most: int
+) -> FloatArray:
+    """Return the chance of the gain of a model over each smaller one on the sealed blocks.
+
+    Shape (k, most): for k smaller models, if 1 to ``most`` causes count as tested there.
+    """
+    unsure, new = _while_unsure(task, model), fair_residual(task, model)
+    counts = range(1, most + 1)
+
+    def chances(before: Extended) -> list[float]:
+        rests = _told_rests(task, fair_residual(task, before), new, unsure)
+        return [chance_of_gain(*rests, tried, tested) for tested in counts]
+
+    return np.array(each_in_threads(chances, smaller))
+
+
+def _told_rests(
+    task: Task, old: FloatArray, new: FloatArray, unsure: BoolArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return two residuals whitened, (n,), on the sealed rows that count, and their sub-blocks.
+
+    Times at which the onset may lie according to the open blocks do not count: there the models
+    cannot know whether the change has happened.
+    """
+    rows = task.grids.sealed_rows
+    told = rows & ~unsure
+    if len(np.unique(task.grids.sub[told])) >= _LEAST_PARTS:
+        rows = told
+    sealed = replace(task, rows=rows)
+    return sealed.innovations(old), sealed.innovations(new), task.grids.sub[rows]
+
+
+def _while_unsure(task: Task, model: Extended) -> BoolArray:
     """Return the means at times where an onset may lie, shape (m,)."""
     day = task.grids.means(task.grids.time_s) / DAY_S
     out = np.zeros(len(day), dtype=bool)
@@ -457,8 +481,8 @@ def by_segment(
 # are not those of noise alone. Of 15 profile intervals for a valve or a reheater, in the sets
 # 82001, 93001 and 94001 of `benchmarks.naming`, 9 held the true size; at twice their width 14.
 # The breakpoints beside a bend take a part of it, in more than one way: of 27 intervals in the
-# studies 55320 to 55382 of `benchmarks.diagnosis_study` 14 held the true value. So that of its
-# height is widened too, and those of its place and width are the wider ones of both kinds.
+# studies 55320 to 55382 of `benchmarks.diagnosis_study` 14 held the true value. The interval of
+# its height is widened too; those of its place and width are the wider ones of both kinds.
 
 
 _Z95 = 1.959963984540054
@@ -586,7 +610,8 @@ class Certainty:
                 if not smooth:
                     ends = self.profile(c, k, own)
                     low, high = min(low, ends[0]), max(high, ends[1])
-                if bend == smooth and not unknown.dated:
+                rough = not (smooth or unknown.dated or a.cause.stage is Stage.FLOW)
+                if rough or (bend and smooth):
                     low = max(value - _WIDER * (value - low), unknown.low)
                     high = min(value + _WIDER * (high - value), unknown.high)
                 if unknown.concealed:

@@ -172,12 +172,12 @@ def answer(
     if path is None:
         path = region_path(model, x)
     shown = sorted(model.at(Stage.OUTPUT), key=lambda a: a.cause.order)
-    return _shown(grids, model, x, path, shown)
+    return _measured(grids, model, x, path, shown)
 
 
 def response(grids: Grids, model: Extended, change: FloatArray, path: ByteArray) -> FloatArray:
     """Return what a small change of x, (n,), makes of the means of the power, (m,)."""
-    return _shown(grids, model, change, path, lags_of(model))
+    return _measured(grids, model, change, path, lags_of(model))
 
 
 def lags_of(model: Extended) -> list[FittedCause]:
@@ -186,7 +186,7 @@ def lags_of(model: Extended) -> list[FittedCause]:
     return sorted(late, key=lambda a: a.cause.order)
 
 
-def _shown(
+def _measured(
     grids: Grids, model: Extended, x: FloatArray, path: ByteArray, causes: list[FittedCause]
 ) -> FloatArray:
     group = 1 if causes else grids.group

@@ -195,7 +195,7 @@ _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)
 _LINE_SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
 _SLOW_MEANS = 720  # two hours
 _LARGEST_SUM = 0.9
-_SMALL = 1e-6
+_SMALL, _KNOT_STEP = 1e-6, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,9 +292,20 @@ def base_tangents(task: Task, model: Extended) -> FloatArray:
     if late:
         table = means_through(grids, late, table)
     table = _by_base(table, model).take(np.flatnonzero(base_mask(task, model)), axis=1)
-    if base.offset_mw is not None and driven.gain is not None:
-        path = region_path(model, flow_of(model, driven))
-        table[:, -1] = response(grids, model, driven.gain, path)
+    jumps = np.flatnonzero(base.left[1:] != base.right[:-1])
+    gain = None if base.offset_mw is None else driven.gain
+    if gain is None and not len(jumps):
+        return table
+    x = flow_of(model, driven)
+    path = region_path(model, x)
+    if gain is not None:
+        table[:, -1] = response(grids, model, gain, path)
+    for k in jumps:
+        # Rows that a moved knot carries over its jump have no derivative.
+        knots, by = base.knots.copy(), _KNOT_STEP * np.ptp(base.knots)
+        knots[k + 1] += by
+        moved = flow_of(replace(model, base=replace(base, knots=knots)), driven)
+        table[:, base.pieces + 1 + k] = response(grids, model, (moved - x) / by, path)
     return table
 
 

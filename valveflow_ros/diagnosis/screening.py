@@ -10,6 +10,7 @@ products, without another pass over the data.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ import numpy as np
 from valveflow_ros.curve.regional_model import RegionalModel
 from valveflow_ros.diagnosis.cause import Cause, FittedCause, Start, Values
 from valveflow_ros.diagnosis.extended import (
+    Drive,
     Extended,
     answer,
     drive,
@@ -92,7 +94,6 @@ class Screening:
         self.rest = self.e - self.n @ (self._inverse @ (self.n.T @ self.e))
         self.floor = float(self.rest @ self.rest)
         self.hats = self._hat_knots()
-        self._sums: FloatArray | None = None
 
     def _hat_knots(self) -> FloatArray:
         u = self.grids.u[self.grids.usable > 0]
@@ -104,8 +105,7 @@ class Screening:
     def carriers(self) -> FloatArray:
         """Return d power / d (gain, u, offset, curve at the hats), shape (m, 3 + HATS)."""
         grids, model = self.grids, self.model
-        driven = drive(grids, model)
-        x, path = self._flow()
+        driven, x, path = self._driven()
 
         def scaled(factor: float) -> FloatArray:
             return answer(grids, model, replace(driven, u=driven.u * factor))
@@ -121,27 +121,24 @@ class Screening:
             columns.append(response(grids, model, hat * gain, path))
         return np.column_stack(columns)
 
-    def _flow(self) -> tuple[FloatArray, ByteArray]:
-        """Return the steam power x in MW and the region of every model row, (n,)."""
-        x = flow_of(self.model, drive(self.grids, self.model))
-        return x, region_path(self.model, x)
+    def _driven(self) -> tuple[Drive, FloatArray, ByteArray]:
+        """Return the inputs of the curve, x in MW and the region of every model row, (n,)."""
+        driven = drive(self.grids, self.model)
+        x = flow_of(self.model, driven)
+        return driven, x, region_path(self.model, x)
 
-    @property
+    @functools.cached_property
     def sums(self) -> FloatArray:
         """Return products of the columns (tangents, carriers, residual), summed over sub-blocks.
 
         Shape (subs, P + 4 + HATS, P + 4 + HATS) with P tangents; sealed sub-blocks are zero. The
         tangents are *not* removed from the carriers here, but after weighting; see `modulated`.
         """
-        if self._sums is None:
-            carriers = self.task.innovations(self.carriers())
-            table = np.column_stack([self.n, carriers, self.rest])
-            sub = self.grids.sub[self.task.rows]
-            edges = np.searchsorted(sub, np.arange(self.grids.subs + 1))
-            self._sums = np.stack(
-                [table[a:b].T @ table[a:b] for a, b in itertools.pairwise(edges)]
-            )
-        return self._sums
+        carriers = self.task.innovations(self.carriers())
+        table = np.column_stack([self.n, carriers, self.rest])
+        sub = self.grids.sub[self.task.rows]
+        edges = np.searchsorted(sub, np.arange(self.grids.subs + 1))
+        return np.stack([table[a:b].T @ table[a:b] for a, b in itertools.pairwise(edges)])
 
     def modulated(self, which: list[int], weights: FloatArray) -> tuple[float, FloatArray]:
         """Return the log-likelihood gain of carriers times functions of time, and coefficients.
@@ -251,13 +248,14 @@ class Screening:
         """Return the beginning of a sub-block in seconds after the first row."""
         return float(np.searchsorted(self.grids.sub, sub)) * self.grids.mean_s
 
+    @functools.cached_property
     def gain_by_sub(self) -> tuple[FloatArray, FloatArray]:
         """Return, by sub-block, the square of the gain column and its product with the residual.
 
         The tangents are not removed from the column: over the whole record the curve could explain
         all of the gain, and nothing would remain.
         """
-        x, path = self._flow()
+        _, x, path = self._driven()
         column = self.task.innovations(response(self.grids, self.model, x, path))
         sub = self.grids.sub[self.task.rows]
         own, toward = (np.bincount(sub, column * x, self.grids.subs) for x in (column, self.rest))

@@ -376,7 +376,8 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
         evidence = weigh(found.task, without, rival.model, rival.added.size)
         if not evidence.enough:
             found.reasons[rival.added.name] = evidence.reason()
-            if best is None and rival.added.name != _INTERVALS:  # these imitate several causes
+            # Intervals can imitate several causes, so they hide none.
+            if best is None and rival.added.name != _INTERVALS:
                 best = rival.score
             continue
         _note(found, rival, rivals, evidence)
@@ -417,7 +418,7 @@ def _note(found: SearchResult, chosen: Rival, rivals: list[Rival], evidence: Evi
     del behind[name]
     found.reasons.pop(name, None)
     found.evidence[name] = evidence
-    found.near[name] = tuple(n for n, by in behind.items() if by < NOT_TOLD_APART)
+    found.near[name] = tuple(n for n, by in behind.items() if abs(by) < NOT_TOLD_APART)
     for other, by in behind.items():
         if by > 0.0:
             found.reasons[other] = f'{name} explains the data better (log-likelihood {by:+.1f})'
@@ -541,13 +542,13 @@ def _shortlist(found: SearchResult, barred: set[str], known: dict[str, list[Star
     if untried := [name for name in wanted if name not in known]:
         screening = Screening(task, model, found.rough)
         before = replace(model, base=found.start.base)
-        screening.sums  # noqa: B018 - once, before several threads need them
+        _ = screening.sums  # computed once, before several threads need them
 
         def starts_of(name: str) -> list[Start]:
             on = Screening(task, before, found.rough) if name == _BEND else screening
             return list(every[name].starts(on))
 
-        known |= zip(untried, each_in_threads(starts_of, untried), strict=True)
+        known.update(zip(untried, each_in_threads(starts_of, untried), strict=True))
     best = {name: max(s.gain for s in known[name]) for name in wanted if known[name]}
     if not best or max(best.values()) < SCREEN_LEAST:
         return []
@@ -561,19 +562,18 @@ def _refitted(trials: Trials, names: list[str]) -> list[tuple[Extended, float]]:
     """Return the models with one of these causes each, and their sums of squares."""
     task, refits = trials.task, trials.refits
     every, untried = causes_for(task.grids), [name for name in names if name not in refits]
-    near: list[Extended] = []
-    far: list[Extended] = []
+    from_model: list[Extended] = []
+    from_own_base: list[Extended] = []
     for name, start in ((n, s) for n in untried for s in trials.starts[n]):
         base = trials.model.base if start.base is None else start.base
         added = FittedCause(every[name], start.values, start.extra)
-        (near if start.base is None else far).append(
-            replace(trials.model, base=base).with_cause(added)
-        )
+        begin = from_model if start.base is None else from_own_base
+        begin.append(replace(trials.model, base=base).with_cause(added))
     begun: dict[str, list[tuple[Extended, float]]] = {}
-    for model, cost in each_in_threads(lambda m: improve(task, m, 2), far):
+    for model, cost in each_in_threads(lambda m: improve(task, m, 2), from_own_base):
         begun.setdefault(model.names[-1], []).append((model, cost))
-    tangents = task.innovations(base_tangents(task, trials.model)) if near else None
-    todo: list[tuple[Extended, FloatArray | None]] = [(model, tangents) for model in near]
+    tangents = task.innovations(base_tangents(task, trials.model)) if from_model else None
+    todo: list[tuple[Extended, FloatArray | None]] = [(m, tangents) for m in from_model]
     for several in begun.values():
         best_first = sorted(several, key=lambda m: m[1])
         todo += [(model, None) for model, _ in best_first[:_REFITTED]]

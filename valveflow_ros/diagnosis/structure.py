@@ -406,7 +406,7 @@ def wander(screening: Screening) -> Wander:
     Kernels of several widths are tried. Each sub-block is predicted without its own data, so that
     the noise inside it gives no gain.
     """
-    own, toward = screening.gain_by_sub()
+    own, toward = screening.gain_by_sub
     middle_h = screening.grids.sub_middle_s / 3600.0
     distance = np.abs(middle_h[:, None] - middle_h[None, :])
     np.fill_diagonal(distance, np.inf)

@@ -49,10 +49,11 @@ _LEAST_GAIN, _LEAST_Z, _LEAST_APART = 12.0, 2.5, 0.003
 # A searched exponent gains by chance over the given one: of 42 random plants with the given
 # exponent, one seemed to have another, with a gain of 15.
 _EXPONENT_GAIN, _EXPONENT_APART = 30.0, 0.001
-# If undecided, the form over V is used if its gain exceeds this many standard errors, or if the
-# exponent of the paper's form is at an end of its range. It is there in units of the other form
-# only: set after a look at the units 2335, 1306 and 93004 of `benchmarks.thermal_study`.
+# If undecided, the form over V is used if its gain exceeds this many standard errors.
 _LIKELIER_Z = 1.5
+# The same if the exponent of the paper's form is at an end of its range, as it is in units of the
+# other form only: set after a look at 2335, 1306 and 93004 of `benchmarks.thermal_study`.
+_DOUBTFUL_Z = 0.5
 _CHOKED_EXPONENT = 1.0
 _WORST = 0.05
 _LEAST_IN_CELL, _EIGHTHS = 5, 8
@@ -145,7 +146,8 @@ def find_form(
     ideal = _CHOKED_EXPONENT if within == EXPONENTS else exponent
     choked = known.exponent if known is not None and known.scaled else ideal
     usual = known if known is not None and not known.scaled else None
-    paper = _with_exponent(means, usual or StaticForm(INTEGRATED_INPUT, exponent))
+    given_paper = usual or StaticForm(INTEGRATED_INPUT, exponent)
+    paper = _with_exponent(means, given_paper)
     moves = pressure_range(means.pressure) >= LEAST_PRESSURE_RANGE
     scaled = (
         _best(means, OPENING, within) if moves else _fitted(means, StaticForm(OPENING, choked))
@@ -164,8 +166,9 @@ def find_form(
         # The exponent is not determined: use that of ideal choked flow.
         scaled = _fitted(means, StaticForm(OPENING, choked))
         gain, sure, told = _told(means, scaled, paper)
-    doubtful = paper.form.exponent != exponent and _at_end(paper, within)
-    takes_scaled = gain > _LEAST_GAIN and (doubtful or sure > _LIKELIER_Z)
+    searched = paper.form.exponent != given_paper.exponent
+    doubtful = searched and _at_end(paper, exponents_near(given_paper.exponent))
+    takes_scaled = gain > _LEAST_GAIN and sure > (_DOUBTFUL_Z if doubtful else _LIKELIER_Z)
     if known is not None and known.scaled:
         takes_scaled = not _told(means, paper, scaled)[2]
     if held is not None:

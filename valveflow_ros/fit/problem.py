@@ -263,9 +263,11 @@ class Problem:
         cost, rows = square_sum(residual, weight, ar)
         return float(cost), int(rows)
 
-    def _stretches(self, model: RegionalModel, **need: int) -> list[tuple[int, int, int]]:
+    def _stretches(
+        self, model: RegionalModel, also: int = 0, least: int = 0
+    ) -> list[tuple[int, int, int]]:
         s = self.samples
-        return stretches(model, s.means, s.group, s.step_s, self.settle, **need)
+        return stretches(model, s.means, s.group, s.step_s, self.settle, also=also, least=least)
 
 
 def stretches(

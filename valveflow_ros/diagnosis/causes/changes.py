@@ -280,7 +280,8 @@ def apply_intervals(values: Values, grids: Grids, extra: Values) -> FloatArray:
     """
     # Return the factor on x; ``extra`` holds the switching times in seconds.
     span = grids.reference.span_s
-    edges = np.append(np.asarray(extra), span if len(extra) % 2 else []).reshape(-1, 2)
+    # The last state goes on: later rows are corrected by the same causes.
+    edges = np.append(np.asarray(extra), np.inf if len(extra) % 2 else []).reshape(-1, 2)
     # Relative to the mean over the record, as for a drift.
     share = float(np.sum(np.diff(np.clip(edges, 0.0, span)))) / span
     out = np.full(len(grids.time_s), 1.0 - values[0] * share)
@@ -300,7 +301,7 @@ def intervals_starts(screening: Screening) -> Sequence[Start]:
 
 
 def _search(screening: Screening, size: float) -> Start | None:
-    own, toward = screening.gain_by_sub()
+    own, toward = screening.gain_by_sub
     path = np.zeros(len(own), dtype=np.uint8)
     share = _FIRST_SHARE
     for _ in range(_ROUNDS):
@@ -341,7 +342,7 @@ def infer(screening: Screening, active: FittedCause, allowed: BoolArray) -> Valu
 
     The screening belongs to the model without this cause.
     """
-    own, toward = (np.where(allowed, x, 0.0) for x in screening.gain_by_sub())
+    own, toward = (np.where(allowed, x, 0.0) for x in screening.gain_by_sub)
     edges = np.asarray(active.extra)
     middle = screening.grids.sub_middle_s
     share = float((np.searchsorted(edges, middle, side='right') % 2).mean())

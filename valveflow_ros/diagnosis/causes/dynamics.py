@@ -175,7 +175,11 @@ def apply_clock(y: FloatArray, values: Values, grids: Grids) -> FloatArray:
         rows = min(rows, len(y))
         return np.concatenate([y[rows:], np.repeat(y[-1:], rows, axis=0)])
 
-    return np.asarray((1.0 - part) * ahead(int(whole)) + part * ahead(int(whole) + 1))
+    out, after = ahead(int(whole)), ahead(int(whole) + 1)
+    out *= 1.0 - part
+    after *= part
+    out += after
+    return out
 
 
 def clock_starts(screening: Screening) -> Sequence[Start]:
