@@ -95,6 +95,17 @@ def test_every_cause_changes_the_answer_and_nothing_is_nothing(grids, name):
     assert np.abs(changed - answer(grids, plain))[grids.scored].max() > 1e-3
 
 
+@pytest.mark.parametrize('switches', [(), (0.3,), (0.2, 0.7), (0.2, 0.4, 0.8)])
+def test_what_is_switched_stays_so_after_the_record_in_which_it_was_found(grids, switches):
+    act = catalogue()['intervals'].act
+    span = 0.5 * grids.reference.span_s
+    earlier = replace(grids, reference=replace(grids.reference, span_s=span))
+    factor = act((0.01,), earlier, tuple(span * x for x in switches))
+    state = np.searchsorted(np.array(switches) * span, grids.time_s, side='right') % 2
+    assert factor - factor[0] == pytest.approx(0.01 * state)
+    assert factor[grids.time_s < span].mean() == pytest.approx(1.0, abs=1e-4)
+
+
 def test_an_answer_is_the_same_whatever_was_asked_before(grids):
     stiction = FittedCause(catalogue()['stiction'], TYPICAL['stiction'])
     free = Extended(rough_model()).with_cause(stiction)
