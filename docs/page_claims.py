@@ -196,12 +196,7 @@ def _diagnosis() -> list[Row]:
     r = result(_SMALL)
     silent = sum(not row['names'] for row in r['rows'])
     beside = r['records'] - r['right'] - silent
-    healthy = [
-        _row(f'healthy units built from physics, {words}, eight days, no covariate',
-             ', '.join(f'{_kind_words(kind)} {s["named"]} of {s["units"]} named'
-                       for kind, s in result(name)['summary'].items()), name)
-        for words, name in _NAMES.items()
-    ]  # fmt: skip
+    healthy = [_of_healthy_units(words, name) for words, name in _NAMES.items()]
     return [
         *rows,
         _row(
@@ -215,6 +210,18 @@ def _diagnosis() -> list[Row]:
         *healthy,
         _since_model(),
     ]  # fmt: skip
+
+
+def _of_healthy_units(words: str, name: str) -> Row:
+    """Return what is named in healthy units built from physics."""
+    days = 'five' if '--days 5' in result(name)['command'] else 'eight'
+    kinds = result(name)['summary'].items()
+    named = ', '.join(f'{_kind_words(k)} {s["named"]} of {s["units"]} named' for k, s in kinds)
+    names = sorted({n for _, s in kinds for n in s['names']})
+    return _row(
+        f'healthy units built from physics, {words}, {days} days, no covariate',
+        named + (f': {", ".join(names)}' if names else ''), name,
+    )  # fmt: skip
 
 
 def _at_best(r: dict[str, Any]) -> str:
