@@ -43,6 +43,7 @@ def test_one_fault_is_one_story(capsys):
     story = Story(FAULT)
     story.on_curve(FlowCharacteristic(status=FlowCharacteristic.UNKNOWN, cause='No rows.'))
     story.on_alarm(alarm(T0, 0, Alarm.NORMAL))
+    assert story.cause == 'No rows.'
     assert story.outcome() == 'The fault raised no alarm.'
     for k in range(1, 9):
         story.on_curve(curve(T0 + 4 * k * HOUR, [u + k for u in KNEES]))

@@ -145,10 +145,12 @@ class Story:
         self._occurrences: dict[str, int] = {}
         self.alarms_of_fault: list[int] = []  # times of the alarms since then, in ns
         self.curves: list[FlowCharacteristic] = []
+        self.cause = ''  # why there is no curve
         self.diagnoses: list[Diagnosis] = []
 
     def on_curve(self, message: FlowCharacteristic) -> None:
         """Keep a new curve; print the first one."""
+        self.cause = message.cause
         time_ns = from_time(message.window_end)
         known = self.curves and self.curves[-1].model_id == message.model_id
         if message.status != FlowCharacteristic.FRESH or known:
@@ -368,6 +370,8 @@ def _conclude(watch: Watch, story: Story, folder: Path, fault_ns: int, days: flo
             missing.append(f'{verb} failed')
     clean = [c for c in story.curves if from_time(c.window_end) <= fault_ns]
     if not clean:
+        if story.cause:
+            tell(story.cause)
         tell(told_in_the_end(['no curve was found before the fault', *missing], days))
         return 1
     _compare(clean[-1])
