@@ -47,12 +47,12 @@ _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
 _HIDDEN, _NULL = 'hidden_55320_55322', 'null_55400_55499'
-_PAIRS, _TRIPLES = 'pair_55370_55373', 'triple_55380_55382'
+_PAIRS, _TRIPLES = 'pair_55370_55373', 'triple_62310_62314'
 _SMALL = 'diagnosis_hidden_55340_55341_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
-    'every second': 'thermal_names_1s_3501_3517',
-    'means over a minute': 'thermal_names_minute_3201_3217',
+    'every second': 'thermal_names_1s_95201_95208',
+    'means over a minute': 'thermal_names_minute_95001_95017',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
 }
 _KIND_WORDS = {
@@ -173,7 +173,7 @@ def _diagnosis() -> list[Row]:
     for name, question in (
         (_HIDDEN, 'one hidden effect: named, and no other'),
         (_NULL, 'nothing wrong: nothing named, and nothing said to be unexplained'),
-        ('slow_55310_55313',
+        ('slow_62700_62703',
          'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
          'may be named): told as a change in time, and nothing named'),
