@@ -643,14 +643,14 @@ def _own_misfit(found: SearchResult, left: Structure) -> str:
 
 
 def _withdraw_imitations(found: SearchResult) -> None:
-    """Remove causes in time if what the load does to the unit over hours explains more."""
+    """Remove causes in time if the load of hours before explains the power about as well."""
     for a in found.model.active:
         if not a.cause.slow:
             continue
         without, _ = improve(found.task, found.model.without(a.name), 3)
         effect = answer(found.task.grids, found.model) - answer(found.task.grids, without)
         if likelier := likelier_over_hours(found.task, without, effect, a.size):
-            found.withdraw(a.name, f'the {likelier} explains the power better', without)
+            found.withdraw(a.name, f'the {likelier} explains the power about as well', without)
 
 
 def _withdraw_small(found: SearchResult) -> None:
