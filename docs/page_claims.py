@@ -46,7 +46,7 @@ _COVERAGE = {
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_55320_55322', 'null_55400_55499'
+_HIDDEN, _NULL = 'hidden_62400_62402', 'null_55400_55499'
 _PAIRS, _TRIPLES = 'pair_55370_55373', 'triple_62310_62314'
 _SMALL = 'diagnosis_hidden_55340_55341_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
@@ -182,7 +182,7 @@ def _diagnosis() -> list[Row]:
         (_TRIPLES, 'three causes at once: all named'),
         ('outside_55300_55301',
          "effects outside the catalogue, with 0.33 to 0.6 of the noise's sd: none named"),
-        ('outside_55362_55363',
+        ('outside_62600_62602',
          "effects outside the catalogue, with a quarter of the noise's sd: none named"),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
