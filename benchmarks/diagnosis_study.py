@@ -7,8 +7,8 @@
 
 Every plant is drawn: the unit (every third is the paper's), the size of what is hidden (2 to
 4 times the smallest detectable one), sign, onset and phase. ``--recording minute`` diagnoses
-means over a minute, without an earlier model. Thresholds were fixed on seeds
-below 1000.
+means over a minute, without an earlier model. The first thresholds were fixed on
+seeds below 1000; later ones name the seeds where they stand.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ the correction of held values with the units 601 to 605. That a lag or a breakpo
 stopped the whole fit was found on the units 2040 and 2080 of the study of means over a minute, of
 the kind sequence, and on 901 and 909 every second, choked. The limit of a curve that is wrong at
 one place was fixed on units 7003 to 7005 and tried on 7101 to 7302. That an undecided form may be
-the wrong one was found on 2335, of the kind sequence, in means over a minute, and on 1306,
-compressed by exception; that a breakpoint shows in long means alone on 5105, every second.
+the wrong one was found on 2335 and 93004, of the kind sequence, in means over a minute, and on
+1306, compressed by exception; that a breakpoint shows in long means alone on 5105, every second.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ from valveflow_ros.diagnosis.slow import Levels, Regression, half_hours, regress
 from valveflow_ros.fit.whitening import inflation
 from valveflow_ros.records import BoolArray, FloatArray
 
+# Fixed on `benchmarks.diagnosis_study`: healthy plants 61000 to 61047, where the largest gain was
+# 6.2, and effects of 0.15 and 0.25 of the noise, 55362, 55363, 61100, 61101 and 61200 to 61202.
 LEAST_GAIN, LEAST_SIGN, LEAST_MW2 = 12.0, 2.0, 0.02
 _MINUTE_S = 60.0
 _FINE, _MEDIUM, _COARSE, _TRIPLE, _RIPPLE = 24, 8, 4, 4, 48
