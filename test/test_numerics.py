@@ -73,6 +73,26 @@ def test_every_task_is_done_once_and_an_error_is_raised(count):
     assert done[-1] is threading.current_thread()
 
 
+def test_tasks_that_start_threads_share_them_and_give_them_back():
+    before, seen = threading.active_count(), []
+
+    def inner(a, b):
+        seen.append((a, b, threading.active_count() - before))
+
+    def outer(a):
+        run_in_threads(lambda b: inner(a, b), [(b,) for b in range(6)], 3)
+
+    for _ in range(3):
+        run_in_threads(outer, [(a,) for a in range(6)], 3)
+    assert sorted(s[:2] for s in seen) == sorted(3 * [(a, b) for a in range(6) for b in range(6)])
+    assert max(s[2] for s in seen) <= 2
+    assert numerics.each_in_threads(str, range(9)) == list('012345678')
+    started = []
+    barrier = threading.Barrier(3, timeout=10.0)
+    run_in_threads(lambda k: started.append((k, barrier.wait())), [(k,) for k in range(3)], 3)
+    assert len(started) == 3  # three at once again
+
+
 # --- compiled code ---------------------------------------------------------------------------
 
 HOW = ('inlined', 'helper', 'copied')

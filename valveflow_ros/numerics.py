@@ -146,7 +146,6 @@ def copied(function: _Function) -> _Function:
 
 T = TypeVar('T')
 R = TypeVar('R')
-_helping, _helpers = threading.Lock(), [0]  # threads that help now
 _FEW = 4
 _END = object()
 # Interval at which a thread that waits for space checks if it must stop.
@@ -167,6 +166,28 @@ def cores() -> int:
 def runs(count: int, length: int) -> list[tuple[int, int]]:
     """Divide ``range(count)`` into runs of at most ``length``, the last one first."""
     return [(first, min(first + length, count)) for first in range(0, count, length)][::-1]
+
+
+class _Helpers:
+    """The number of threads that help now, in all calls of `run_in_threads` together."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Count from none: the threads of a process are not in its fork."""
+        self.lock, self.count = threading.Lock(), 0
+
+    def add(self, wanted: int, most: int) -> int:
+        """Count up to ``wanted`` more, ``most`` in all; return how many."""
+        with self.lock:
+            more = max(0, min(wanted, most - self.count))
+            self.count += more
+        return more
+
+
+_helpers = _Helpers()
+os.register_at_fork(after_in_child=_helpers.begin)
 
 
 def run_in_threads(
@@ -198,12 +219,10 @@ def run_in_threads(
 
     def help_out() -> None:
         loop()
-        with _helping:
-            _helpers[0] -= 1
+        with _helpers.lock:
+            _helpers.count -= 1
 
-    with _helping:
-        count = max(0, min(threads - 1 - _helpers[0], len(waiting) - 1))
-        _helpers[0] += count
+    count = _helpers.add(len(waiting) - 1, threads - 1)
     helpers = [threading.Thread(target=help_out, daemon=True) for _ in range(count)]
     for helper in helpers:
         helper.start()

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -35,7 +35,7 @@ from valveflow_ros.fit.problem import (
     within_reach,
 )
 from valveflow_ros.fit.whitening import fit_ar
-from valveflow_ros.numerics import cores, jit, run_in_threads
+from valveflow_ros.numerics import cores, each_in_threads, jit, run_in_threads
 from valveflow_ros.records import BoolArray, FloatArray
 
 # Causes that depend on unmeasured noise: simulations with several noise realisations.
@@ -322,19 +322,6 @@ def _by_base(table: FloatArray, model: Extended) -> FloatArray:
     return np.asarray(table @ np.column_stack(columns))
 
 
-def _columns(
-    rows: int, column: Callable[..., FloatArray], places: Sequence[tuple[int, ...]]
-) -> FloatArray:
-    """Return ``column(*place)`` of every place, shape (rows, places), computed in threads."""
-    table = np.empty((rows, len(places)))
-
-    def work(j: int) -> None:
-        table[:, j] = column(*places[j])
-
-    run_in_threads(work, [(j,) for j in range(len(places))], cores())
-    return table
-
-
 def _slots(model: Extended) -> list[tuple[int, int]]:
     """Return (cause, parameter) of every parameter fitted by Gauss-Newton."""
     return [
@@ -358,7 +345,8 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
     slots = _slots(model)
     path = region_path(model, flow_of(model, drive(grids, model)))
 
-    def column(c: int, k: int) -> FloatArray:
+    def column(slot: tuple[int, int]) -> FloatArray:
+        c, k = slot
         stage = model.active[c].cause.stage
         keep = None if stage == Stage.DYNAMICS else path
         h = model.active[c].cause.unknowns[k].step_on(grids)
@@ -367,7 +355,7 @@ def cause_tangents(task: Task, model: Extended) -> FloatArray:
         change = answer(grids, up, None, keep) - answer(grids, down, None, keep)
         return np.asarray(change / max(width, 1e-12))
 
-    return _columns(len(grids.power), column, slots)
+    return np.column_stack([np.empty((len(grids.power), 0)), *each_in_threads(column, slots)])
 
 
 def level_tangents(task: Task, model: Extended) -> FloatArray:

@@ -38,9 +38,9 @@ _SLOW = (
     'travel of the last hour', 'pressure given u',
 )  # fmt: skip
 _SLOW_HATS = 5
-# Log-likelihood by which a cause in time must exceed a dependence on the load of hours: on eight
-# daily cycles of `benchmarks.diagnosis_study` (55320 to 62400) it did by 17 to 54, and one that
-# was none, the effect of the load outside its catalogue with the seed 62600, by 2.
+# Log-likelihood by which a cause in time must exceed a dependence on the load of hours: seven true
+# daily cycles of `benchmarks.diagnosis_study` (55320 to 62400) did by 15 to 55. The effect of the
+# load of hours before, seed 62600, was named a daily cycle that did by 2.
 _LEAD = 5.0
 _IN_TRIPLES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 
