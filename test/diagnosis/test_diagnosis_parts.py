@@ -37,12 +37,14 @@ from valveflow_ros.diagnosis.fitting import (
     base_tangents,
     cause_tangents,
     held,
+    improve,
     whitening,
 )
 from valveflow_ros.diagnosis.grids import ORDER, SEALED_FOLD, make_grids
 from valveflow_ros.diagnosis.result import model_from_json, model_to_json
+from valveflow_ros.diagnosis.screening import Screening
 from valveflow_ros.diagnosis.search import Rival, SearchResult, _add, simplified
-from valveflow_ros.diagnosis.structure import likelier_over_hours, structure, variables
+from valveflow_ros.diagnosis.structure import likelier_over_hours, structure, variables, wander
 from valveflow_ros.errors import DataError, TooFewSamplesError
 from valveflow_ros.records import SampleTable, Signal
 from valveflow_ros.signals.static_form import OPENING, StaticForm
@@ -276,6 +278,26 @@ def test_a_wander_is_whitened_as_by_its_dense_covariance(gaps_h, scale_h, ratio,
     assert level == pytest.approx(np.log(np.diag(factor)).sum(), rel=1e-8, abs=1e-8)
 
 
+@given(st.integers(1, 40), st.sampled_from([1, 2, 4, 8]), st.integers(1, 5), st.integers(0, 999))
+def test_sums_of_knots_are_products_of_dense_matrices(m, corners, width, seed):
+    rng, knots = np.random.default_rng(seed), 9
+    at = np.array([rng.permutation(knots)[:corners] for _ in range(m)])
+    weight = rng.random((m, corners)) * (rng.random((m, corners)) < 0.8)
+    band, across, toward = rng.normal(size=(m, width)), rng.normal(size=(m, 3)), rng.normal(size=m)
+    basis, dense = np.zeros((m, knots)), np.zeros((m, m))
+    np.put_along_axis(basis, at, weight, axis=1)
+    for k in range(min(width, m)):
+        upper = np.diag(band[: m - k, k], k)
+        dense += upper if k == 0 else upper + upper.T
+    halves, sums_across, sums_toward = (
+        np.zeros(s) for s in ((2, knots, knots), (knots, 3), knots)
+    )
+    kernels.sums_of_knots(at, weight, band, across, toward, halves, sums_across, sums_toward)
+    assert halves[0] + halves[1] + halves[1].T == pytest.approx(basis.T @ dense @ basis, abs=1e-12)
+    assert sums_across == pytest.approx(basis.T @ across, abs=1e-12)
+    assert sums_toward == pytest.approx(basis.T @ toward, abs=1e-12)
+
+
 def test_means_are_those_of_the_filter_of_single_rows(grids):
     x = rough_model().static(grids.u)
     path = np.zeros(len(x), dtype=np.uint8)
@@ -300,17 +322,35 @@ def test_the_size_of_a_remaining_structure_is_that_of_the_effect(grids, variable
     # Noise that lasts for minutes, and an effect that comes and goes or lasts for hours.
     plain, ar = Extended(rough_model()), np.array([0.95, 0.0, 0.0, 0.0])
     task = Task(grids, grids.open_rows, ar)
-    x = np.repeat(variables(task, plain)[variable], 6)
-    x = np.concatenate([x, np.full(len(grids.power) - len(x), x[-1])])
+    x = variables(task, plain)[variable]
     effect = 1.5 * np.sign(x - np.median(x[grids.open_rows]))
     noise = np.random.default_rng(5).normal(0.0, 0.1, len(x))
     for k in range(1, len(noise)):
         noise[k] += 0.95 * noise[k - 1]
     seen = Task(replace(grids, power=answer(grids, plain) + effect + noise), task.rows, ar)
-    found = structure(seen, plain)
+    found = structure(seen, plain, Screening(seen, plain))
     assert variable in found.variables
     true_mw2 = float(np.var(effect[grids.open_rows]))
     assert 0.3 * true_mw2 < found.explained_mw2 < 2.0 * true_mw2
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_only_what_the_model_cannot_explain_is_a_structure(grids, seed):
+    plain, rng = Extended(rough_model()), np.random.default_rng(seed)
+    task = Task(grids, grids.open_rows, np.zeros(ORDER))
+    noise, values = rng.normal(0.0, 1.0, len(grids.power)), variables(task, plain)
+    within = base_tangents(task, plain) @ rng.normal(size=base_mask(task, plain).sum())
+    x, y = (values[name] - np.median(values[name]) for name in ('temperature', 'ramp'))
+    both = 0.6 * np.tanh(3.0 * x / np.std(x)) * np.tanh(3.0 * y / np.std(y))
+    rows = task.rows
+    found = []
+    for power in (noise, noise + within * 0.5 / np.std(within[rows]), noise + both):
+        seen = replace(task, grids=replace(grids, power=answer(grids, plain) + power))
+        fitted, _ = improve(seen, plain, 4)
+        found.append(structure(seen, fitted, Screening(seen, fitted)))
+    assert [s.there for s in found] == [False, False, True]
+    assert found[2].variables == ('temperature', 'ramp')
+    assert found[2].explained_mw2 == pytest.approx(float(np.var(both[rows])), rel=0.5)
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
@@ -318,17 +358,18 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
     samples = table(2.0, 1, (), unit())
     grids = make_grids(*record(samples).about, np.zeros(samples.values.shape, dtype=bool))
     plain = Extended(rough_model())
-    x = np.repeat(variables(Task(grids, grids.open_rows, np.zeros(4)), plain)[HOURS_BEFORE], 6)
-    x = np.concatenate([x, np.full(len(grids.power) - len(x), x[-1])])
+    x = variables(Task(grids, grids.open_rows, np.zeros(4)), plain)[HOURS_BEFORE]
     rng, keep = np.random.default_rng(seed), np.exp(-grids.mean_s / (6.0 * 3600.0))
-    wander = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(0.0, 0.5, len(x)))
-    noise = wander + rng.normal(0.0, 1.0, len(x))
+    slow = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(0.0, 0.5, len(x)))
+    noise = slow + rng.normal(0.0, 1.0, len(x))
     daily = np.cos(2.0 * np.pi * grids.means(grids.time_s) / 86_400.0)
     for size, there in ((0.0, False), (0.8, True)):
         power = answer(grids, plain) + noise + size * np.sign(x - np.median(x))
         seen = replace(grids, power=power)
         task = Task(seen, grids.open_rows, whitening(seen, noise))
-        found = structure(task, plain)
+        screening = Screening(task, plain)
+        level = wander(screening).level[grids.sub] * screening.here
+        found = structure(task, plain, screening, level)
         assert found.there == there
         assert not there or HOURS_BEFORE in found.variables
         # A plant with a daily programme repeats it each day.

@@ -497,10 +497,11 @@ def _look_again(found: SearchResult) -> _Rest:
     """Test the residual of the model with all causes."""
     screening = Screening(found.task, found.model)
     slow = wander(screening)
-    left = structure(found.task, found.model, _wandering(found.task.grids, screening, slow))
+    level = _wandering(found.task.grids, screening, slow)
+    left = structure(found.task, found.model, screening, level)
     own = _own_misfit(found, left)
     if own:
-        left = replace(left, gain=0.0, explained_mw2=0.0)
+        left = replace(left, there=False)
     slowly = drift(found.task, found.model)
     return _Rest(slow, left, period(found.task, found.model), slowly, own)
 

@@ -132,6 +132,43 @@ def innovations(table: FloatArray, ar: FloatArray, rows: BoolArray, out: FloatAr
 
 
 @jit
+def sums_of_knots(
+    at: IntArray, weight: FloatArray, band: FloatArray, across: FloatArray, toward: FloatArray,
+    normal: FloatArray, sums_across: FloatArray, sums_toward: FloatArray,
+) -> None:  # fmt: skip
+    """Add up products of the basis functions of a piecewise-linear function.
+
+    Parameters
+    ----------
+    at, weight : int64 and float64 (m, q)
+        The knots around each mean, and their weights.
+    band : float64 (m, k)
+        Symmetric band matrix: the diagonal and what is above it.
+    across, toward : float64 (m, P), (m,)
+        Columns.
+    normal : float64 (2, K, K)
+        The basis times band matrix times basis: the part of the diagonal, that of what is above.
+    sums_across, sums_toward : float64 (K, P), (K,)
+        The basis times the columns.
+    """
+    m, q = at.shape
+    for t in range(m):
+        for i in range(q):
+            a, w = at[t, i], weight[t, i]
+            if w == 0.0:
+                continue
+            sums_toward[a] += w * toward[t]
+            for p in range(across.shape[1]):
+                sums_across[a, p] += w * across[t, p]
+            for k in range(min(band.shape[1], m - t)):
+                by = w * band[t, k]
+                if by == 0.0:
+                    continue
+                for j in range(q):
+                    normal[min(k, 1), a, at[t + k, j]] += by * weight[t + k, j]
+
+
+@jit
 def means(x: FloatArray, group: int, out: FloatArray) -> None:
     """Write means over ``group`` rows."""
     for b in range(out.size):

@@ -14,12 +14,13 @@ from valveflow_ros.diagnosis.extended import Extended
 from valveflow_ros.diagnosis.fitting import Task
 from valveflow_ros.diagnosis.grids import ORDER
 from valveflow_ros.diagnosis.result import Diagnosis
-from valveflow_ros.diagnosis.structure import minutes, variables
+from valveflow_ros.diagnosis.structure import variables
 from valveflow_ros.records import BoolArray, FloatArray
 
 BINS = 20
 _SHIFTS = 60
 _SEED = 11
+_MINUTE_S = 60.0
 _NORMAL99 = 2.576
 _LEAST_RANGE = 1e-6  # in the unit of any variable
 _PLAY_PERCENT = 1.5
@@ -58,11 +59,24 @@ class Signature:
     share_chance: float
 
 
+def _minutes(task: Task, series: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return means of a series (m,) over a minute, and which of them are complete."""
+    rows = max(1, round(_MINUTE_S / task.grids.mean_s))
+    m = len(series) // rows
+    mean: FloatArray = series[: m * rows].reshape(m, rows).mean(axis=1)
+    return mean, np.asarray(task.rows[: m * rows].reshape(m, rows).all(axis=1), dtype=bool)
+
+
+def _variables(task: Task, model: Extended) -> dict[str, FloatArray]:
+    values = {name: _minutes(task, x)[0] for name, x in variables(task, model).items()}
+    return values | {'time of day': task.grids.clock_s(values['time'])}  # no mean over midnight
+
+
 def signatures(task: Task, before: Extended, after: Extended) -> tuple[Signature, ...]:
     """Return the residual over every variable, on all blocks."""
-    old, good, _, _ = minutes(task, task.residual(before))
-    new = minutes(task, task.residual(after))[0]
-    values = {n: v for n, v in variables(task, before).items() if n in UNITS}
+    old, good = _minutes(task, task.residual(before))
+    new = _minutes(task, task.residual(after))[0]
+    values = {n: v for n, v in _variables(task, before).items() if n in UNITS}
     values['direction'] = _direction(task)
     return tuple(
         _signature(name, values[name], old, new, good)
@@ -78,7 +92,7 @@ def _varies(values: FloatArray) -> bool:
 def _direction(task: Task) -> FloatArray:
     """Return the position inside a backlash gap: -1 after closing, 1 after opening."""
     grids = task.grids
-    v = minutes(task, grids.means(grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0))))[0]
+    v = _minutes(task, grids.means(grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0))))[0]
     out, state, half = np.empty(len(v)), v[0], 0.5 * _PLAY_PERCENT
     for t, here in enumerate(v):
         state = min(max(state, here - half), here + half)
@@ -196,9 +210,9 @@ class ResidualMap:
 
 def residual_maps(task: Task, before: Extended, after: Extended) -> tuple[ResidualMap, ...]:
     """Return the residual over u and time, and over u and the pressure not explained by u."""
-    old, good, _, _ = minutes(task, task.residual(before))
-    new = minutes(task, task.residual(after))[0]
-    values = variables(task, before)
+    old, good = _minutes(task, task.residual(before))
+    new = _minutes(task, task.residual(after))[0]
+    values = _variables(task, before)
     return tuple(_map(a, u, values, old, new, good) for a, u in PAIRS if _varies(values[a][good]))
 
 
