@@ -59,13 +59,16 @@ from valveflow_ros.diagnosis.search import (
     simplified,
 )
 from valveflow_ros.diagnosis.slow import (
+    ANOTHER_SHAPE,
     LEAST_DRIFT_MW,
-    NAMED_SHAPE,
+    LEVELS,
     NO_SHAPE,
+    OF_WANDER,
     Course,
     Drift,
     courses,
     drift,
+    of_causes,
 )
 from valveflow_ros.diagnosis.structure import (
     Period,
@@ -266,21 +269,10 @@ _LEAST_EXPLAINED = 0.001
 # on the sets 88001 and 89001 of `benchmarks.naming`, where false ones explained up to 0.0003.
 _LEAST_SLACK = 0.0004
 _BEND = 'curve_shape'
-# Causes that change the level of the power in time, and equivalent shapes, by their families.
-_LEVELS = (
-    'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
-    'intervals',
-)  # fmt: skip
-_SHAPES = {
-    ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
-    ('drift', 'drift'): ('drift',),
-}  # fmt: skip
-# Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
-_ANOTHER_SHAPE = 6.0
 # By this much intervals must exceed a slow disturbance, which looks much the same: on the seeds
 # 55320 to 62703 of `benchmarks.diagnosis_study` true ones did by 8 to 50, one found in noise not.
 _LEAST_INTERVALS = 4.0
-_MOST_LEVELS = 2  # causes that change the level in time; more of them imitate any slow change
+_MOSTLEVELS = 2  # causes that change the level in time; more of them imitate any slow change
 _FAMILIES = ('drift', 'step')  # families of causes that are also shapes
 _LEAST_SHAPE = 5.0  # the same for a shape over a slow disturbance without a shape
 _LAST_STEPS = 10  # breakpoints converge slowly near a bump
@@ -512,21 +504,18 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
     Causes in time are removed if another shape, or a slow disturbance without a shape, fits better
     than all of them together: a step plus a drift can imitate nearly any slow change.
     """
-    names = [name for name in found.model.names if name in _LEVELS]
+    names = [name for name in found.model.names if name in LEVELS]
     if names == ['curve_step']:
         names = []  # a single curve_step also depends on the load
-    if len(names) > _MOST_LEVELS:
+    if len(names) > _MOSTLEVELS:
         for name in names:
             found.withdraw(name, _SO_MANY, found.model.without(name))
         found.model, _ = improve(found.task, found.model, 3)
         names = []
-    tried = courses(found.task, found.model, names)
+    tried = courses(found.task, found.model, names, found.task.grids.whole)
     if not tried:
         return None
-    mine: tuple[str, ...] = ()
-    if names:
-        families = tuple(sorted(catalogue()[name].family for name in names))
-        mine = (NAMED_SHAPE, *_SHAPES.get(families, ()))
+    mine = of_causes(found.model, names) if names else ()
     best = max((c for c in tried.values() if c.name not in mine), key=lambda c: c.score)
     if names:
         better = best.score - max(tried[shape].score for shape in mine)
@@ -538,6 +527,7 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
                     'the data a little better, but not by enough to decide.'
                 )
             return None
+        families = {catalogue()[name].family for name in names}
         for name in names:
             found.withdraw(name, _OF_SHAPE[best.name], found.model.without(name))
         found.model, _ = improve(found.task, found.model, 3)
@@ -558,11 +548,11 @@ def _largest_lead(names: list[str], shape: str) -> float:
     """Return by how much a shape may fit better than causes that are named all the same."""
     if 'intervals' in names and shape == NO_SHAPE:
         return -_LEAST_INTERVALS
-    return _ANOTHER_SHAPE if len(names) == 1 else 0.0
+    return ANOTHER_SHAPE if len(names) == 1 else 0.0
 
 
 _OF_SHAPE = {
-    NO_SHAPE: 'the power varies slowly all the time, which would look the same',
+    NO_SHAPE: OF_WANDER,
     'drift': 'the power changes evenly in time, which fits better',
     'step': 'the power changes once, which fits better',
     'late drift': 'a drift that begins within the record fits better',

@@ -25,6 +25,7 @@ from valveflow_ros.diagnosis.fitting import (
 )
 from valveflow_ros.diagnosis.grids import DAY_S, Grids
 from valveflow_ros.diagnosis.screening import EDGE_SHARE, Screening
+from valveflow_ros.diagnosis.slow import ANOTHER_SHAPE, LEVELS, OF_WANDER, wander_lead
 from valveflow_ros.errors import TooFewSamplesError, listed
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
@@ -358,10 +359,17 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
     if not rivals:
         return False
     best: float | None = None
+    wander = ''
     for rival in rivals:
         if best is not None and rival.score - best > NOT_TOLD_APART:
             break
-        if doubt := _doubt(found.task, rival):
+        doubt = _doubt(found.task, rival)
+        if not doubt and rival.added.name in LEVELS:
+            # A cause in time that fits worse than one that a slow disturbance beats is beaten too.
+            if not wander and wander_lead(found.task, rival.model) > ANOTHER_SHAPE:
+                wander = OF_WANDER
+            doubt = wander
+        if doubt:
             # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
             continue
@@ -386,7 +394,8 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
         else:
             _take(found, rival, evidence.gain)
         return True
-    return False
+    # Beside what explains much, the others had not been tried.
+    return bool(wander) and _add(found, barred | set(LEVELS))
 
 
 def _add_two(found: SearchResult, barred: set[str]) -> bool:

@@ -319,6 +319,18 @@ _APART = 2  # least distance between two steps, in times of the grid
 _SPREADS_H = (0.0, 4.0)  # duration of a step; two steps have the same one
 _RATES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # time constants relative to the length of the record
 NO_SHAPE, NAMED_SHAPE = 'wander', 'named'
+OF_WANDER = 'the power varies slowly all the time, which would look the same'
+# Causes that change the level of the power in time, and equivalent shapes, by their families.
+LEVELS = (
+    'gain_drift', 'output_offset_drift', 'input_drift', 'gain_step', 'input_step', 'curve_step',
+    'intervals',
+)  # fmt: skip
+_SHAPES = {
+    ('drift',): ('drift',), ('step',): ('step',), ('drift', 'step'): ('drift and step',),
+    ('drift', 'drift'): ('drift',),
+}  # fmt: skip
+# Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
+ANOTHER_SHAPE = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,7 +411,9 @@ def _shapes(found: Levels, changes_h: Sequence[float]) -> list[_Shape]:
     return [*steps, *others, _Shape('drift', even * load, (), 1)]
 
 
-def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Course]:
+def courses(
+    task: Task, model: Extended, names: Sequence[str], rows: BoolArray
+) -> dict[str, Course]:
     """Return the best fit of each shape, by name; empty if the record is too short.
 
     Parameters
@@ -409,17 +423,19 @@ def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Cour
     names : sequence of str
         Causes in time that the model contains. They are removed, and their joint effect is one
         more shape, `NAMED_SHAPE`, with a penalty for their parameters.
+    rows : bool (m,)
+        The means to be used.
     """
     without = model
     for name in names:
         without = without.without(name)
-    found, _ = levels(task, without, task.grids.whole, careful=False)
+    found, _ = levels(task, without, rows, careful=False)
     if not found.enough:
         return {}
     named = [a for a in model.active if a.name in names]
     single = _shapes(found, [h for a in named for h in a.changes_h])
     if names:
-        full, _ = levels(task, model, task.grids.whole, careful=False)
+        full, _ = levels(task, model, rows, careful=False)
         numbers = sum(a.size for a in named)
         single.append(_Shape(NAMED_SHAPE, found.power - full.power, (), numbers))
     columns = np.column_stack([s.columns for s in single])
@@ -431,6 +447,23 @@ def courses(task: Task, model: Extended, names: Sequence[str]) -> dict[str, Cour
         name: _course(name, score, chosen, sizes, single, found)
         for name, (score, chosen, sizes) in best.items()
     }
+
+
+def of_causes(model: Extended, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the shapes that stand for causes in time of a model."""
+    families = tuple(sorted(a.cause.family for a in model.active if a.name in names))
+    return (NAMED_SHAPE, *_SHAPES.get(families, ()))
+
+
+def wander_lead(task: Task, model: Extended) -> float:
+    """Return by how much a slow disturbance exceeds the causes in time, on the rows of the fit.
+
+    One `curve_step` alone does not count: it also depends on the load.
+    """
+    names = [name for name in model.names if name in LEVELS]
+    tried = {} if names == ['curve_step'] else courses(task, model, names, task.rows)
+    mine = [tried[shape].score for shape in of_causes(model, names) if shape in tried]
+    return tried[NO_SHAPE].score - max(mine) if mine else 0.0
 
 
 def _scored(
