@@ -272,7 +272,7 @@ _BEND = 'curve_shape'
 # By this much intervals must exceed a slow disturbance, which looks much the same: on the seeds
 # 55320 to 62703 of `benchmarks.diagnosis_study` true ones did by 8 to 50, one found in noise not.
 _LEAST_INTERVALS = 4.0
-_MOSTLEVELS = 2  # causes that change the level in time; more of them imitate any slow change
+_MOST_LEVELS = 2  # causes that change the level in time; more of them imitate any slow change
 _FAMILIES = ('drift', 'step')  # families of causes that are also shapes
 _LEAST_SHAPE = 5.0  # the same for a shape over a slow disturbance without a shape
 _LAST_STEPS = 10  # breakpoints converge slowly near a bump
@@ -507,7 +507,7 @@ def _course(found: SearchResult, again: bool = True) -> Course | None:
     names = [name for name in found.model.names if name in LEVELS]
     if names == ['curve_step']:
         names = []  # a single curve_step also depends on the load
-    if len(names) > _MOSTLEVELS:
+    if len(names) > _MOST_LEVELS:
         for name in names:
             found.withdraw(name, _SO_MANY, found.model.without(name))
         found.model, _ = improve(found.task, found.model, 3)

@@ -359,19 +359,14 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
     if not rivals:
         return False
     best: float | None = None
-    wander = ''
+    doubted: list[str] = []
     for rival in rivals:
         if best is not None and rival.score - best > NOT_TOLD_APART:
             break
-        doubt = _doubt(found.task, rival)
-        if not doubt and rival.added.name in LEVELS:
-            # A cause in time that fits worse than one that a slow disturbance beats is beaten too.
-            if not wander and wander_lead(found.task, rival.model) > ANOTHER_SHAPE:
-                wander = OF_WANDER
-            doubt = wander
-        if doubt:
+        if doubt := _doubt(found.task, rival):
             # It is no candidate, so it must not hide another one that explains less.
             found.reasons[rival.added.name] = doubt
+            doubted.append(rival.added.name)
             continue
         without, cost = improve(found.task, rival.model.without(rival.added.name), 3)
         now = found.task.cost(found.model)
@@ -388,14 +383,15 @@ def _add(found: SearchResult, barred: set[str]) -> bool:
             if best is None and rival.added.name != _INTERVALS:
                 best = rival.score
             continue
-        _note(found, rival, rivals, evidence)
+        _note(found, rival, [r for r in rivals if r.added.name not in doubted], evidence)
         if rival.added.cause.of_model and not found.task.fixed_dynamics:
             _absorb(found, rival)
         else:
             _take(found, rival, evidence.gain)
         return True
-    # Beside what explains much, the others had not been tried.
-    return bool(wander) and _add(found, barred | set(LEVELS))
+    # Causes that explain little beside the best one had not been refitted: now it is their turn.
+    beaten = {name for name in doubted if found.reasons[name] == OF_WANDER}
+    return bool(beaten) and _add(found, barred | beaten)
 
 
 def _add_two(found: SearchResult, barred: set[str]) -> bool:
@@ -699,7 +695,17 @@ def put_in_place_of(
 
 def _doubt(task: Task, rival: Rival) -> str:
     """Return why a rival is no candidate, however well it fits; or ''."""
-    return rival.added.beyond or _without_onset(task, rival) or _small(task, rival)
+    return (
+        rival.added.beyond or _without_onset(task, rival) or _small(task, rival)
+        or _like_a_wander(task, rival)
+    )  # fmt: skip
+
+
+def _like_a_wander(task: Task, rival: Rival) -> str:
+    """Return why a change in time is none: a slow disturbance fits better; or ''."""
+    if rival.added.name not in LEVELS or wander_lead(task, rival.model) <= ANOTHER_SHAPE:
+        return ''
+    return OF_WANDER
 
 
 def _drop_weak(found: SearchResult, barred: set[str]) -> None:

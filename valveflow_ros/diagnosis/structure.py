@@ -39,7 +39,7 @@ _LINE, _RIPPLE, _PLANE, _SPACE, _SIDES = 12, 48, 6, 4, 4
 _ENDS = 0.01  # quantiles of the outermost knots
 # Standard deviation of the values at the knots, relative to that of the residual.
 _PRIORS = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
-_ENOUGH = 0.75
+_ENOUGH, _MOST_JUDGED = 0.75, 3
 _LEAST_RANGE = 1e-9  # in the unit of any variable: what varies by less is constant
 _SLOW = (
     'load of the last hour', 'load of the last four hours', 'load of hours before',
@@ -67,7 +67,8 @@ class Structure:
     sign : float
         t value of the gains of blocks, each from a fit to others: mean divided by standard error.
     explained_mw2 : float
-        Variance of the function or, if larger, what its fit to other blocks explains in MW^2.
+        Variance of the function, which the prior makes smaller, or, if larger, what its fit to
+        other blocks explains in MW^2.
     there : bool
         It is significant, and large enough to be a fault.
     """
@@ -91,10 +92,14 @@ def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
     """Return the variables on which the residual might depend, of every mean, (m,)."""
     grids = task.grids
     each = max(1, round(_MINUTE_S / grids.mean_s))
-    u, p, t = grids.means(grids.u), grids.means(grids.pressure), grids.means(grids.temperature)
-    time_s = grids.means(grids.time_s)
     opening = grids.coarse(np.where(np.isfinite(grids.v), grids.v, 0.0))
-    shape = np.polyfit(u, p, 3)
+    # A gap holds the last values.
+    known = grids.means(grids.usable.astype(np.float64)) >= 1.0
+    last = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
+    u, p, t, v = (
+        grids.means(rows)[last] for rows in (grids.u, grids.pressure, grids.temperature, opening)
+    )
+    time_s, shape = grids.means(grids.time_s), np.polyfit(u, p, 3)
     busy = grids.means(np.abs(np.diff(opening, prepend=opening[:1])))
 
     def before(x: FloatArray, minutes: int) -> FloatArray:
@@ -103,12 +108,12 @@ def variables(task: Task, model: Extended) -> dict[str, FloatArray]:
 
     def past(x: FloatArray, minutes: int) -> FloatArray:
         total = np.cumsum(np.concatenate([[0.0], x]))
-        at = np.arange(1, len(x) + 1)
+        at = np.arange(len(x))
         first = np.maximum(at - minutes * each, 0)
-        return np.asarray((total[at] - total[first]) / (at - first))
+        return np.asarray((total[at] - total[first]) / np.maximum(at - first, 1))
 
     return {
-        'u': u, 'opening': grids.means(opening), 'pressure': p,
+        'u': u, 'opening': v, 'pressure': p,
         'pressure given u': p - np.polyval(shape, u), 'temperature': t,
         'time': time_s, 'time of day': grids.clock_s(time_s), 'ramp': u - before(u, 3),
         'slow ramp': u - before(u, 15), 'pressure change': p - before(p, 10),
@@ -149,13 +154,14 @@ def structure(
 
 
 def _moves(task: Task, u: FloatArray) -> FloatArray:
-    """Return the moves of the last means, columns scaled to 1, (rows, 4).
+    """Return the moves of the last minute or of at most four means, columns scaled to 1.
 
-    Power control moves the valve by the noise of the power. That the power follows such a move
-    in proportion is no structure.
+    Power control moves the valve by the noise of the power within the same mean, so innovations
+    in proportion to the part of a move that the earlier ones do not foretell are no structure.
     """
     move = np.diff(u, prepend=u[:1])
-    late = [np.concatenate([np.zeros(k), move[: len(move) - k]]) for k in range(len(task.ar))]
+    most = min(len(task.ar), max(1, round(_MINUTE_S / task.grids.mean_s)))
+    late = [np.concatenate([np.zeros(k), move[: len(move) - k]]) for k in range(most)]
     table = np.column_stack(late)[task.rows]
     return np.asarray(table / np.maximum(np.sqrt((table**2).sum(axis=0)), 1e-300))
 
@@ -302,22 +308,21 @@ class _FunctionTest:
     ----------
     task : Task
     nuisance : float64 (rows, P)
-        Whitened tangents of the model.
+        What the innovations may follow without being a structure: the whitened tangents of the
+        model, and moves of the valve.
     series : float64 (m,)
     """
 
     def __init__(self, task: Task, nuisance: FloatArray, series: FloatArray) -> None:
         self._task, self._n, self._series = task, nuisance, series
         self._inverse = np.linalg.pinv(nuisance.T @ nuisance, hermitian=True)
-        self._e = e = self._freed(task.innovations(series))
+        e = task.innovations(series)
+        self._e = e = e - nuisance @ (self._inverse @ (nuisance.T @ e))
         self._variance = float(e @ e) / len(e) * colour(task, e)
         self._size = float(np.std(series[task.rows]))
         self._band = self._products()
         self._toward = self._transposed(e)
         self._across = self._transposed(nuisance)
-
-    def _freed(self, white: FloatArray) -> FloatArray:
-        return np.asarray(white - self._n @ (self._inverse @ (self._n.T @ white)))
 
     def _products(self) -> FloatArray:
         """Return the products of the whitening with itself, by mean and distance, (m, 5)."""
@@ -362,29 +367,39 @@ class _FunctionTest:
         return max(tried)
 
     def best(self, functions: list[_Parts], gains: list[float]) -> Structure:
-        """Return the likeliest function, or one of fewer variables that is nearly as likely."""
-        tried = list(zip(gains, functions, strict=True))
-        least = min(_ENOUGH * max(gains), max(gains))
-        fewest = min(len(parts) for gain, parts in tried if gain >= least)
-        gain, parts = max(
-            (each for each in tried if len(each[1]) == fewest), key=lambda each: each[0]
-        )
+        """Return the likeliest function that is significant, or the likeliest one."""
+        tried = sorted(zip(gains, functions, strict=True), key=lambda each: -each[0])
+        # Of those that are nearly as likely, one of the fewest variables comes first.
+        least = max(_ENOUGH * tried[0][0], LEAST_GAIN)
+        nearly = [each for each in tried if each[0] > least]
+        first = min(nearly or tried[:1], key=lambda each: len(each[1]))
+        found = self._judged(*first)
+        for gain, parts in tried[:_MOST_JUDGED]:
+            if found.there or gain <= LEAST_GAIN:
+                break
+            other = self._judged(gain, parts)
+            found = other if other.there else found
+        return found
+
+    def _judged(self, gain: float, parts: _Parts) -> Structure:
         names = tuple(part.variable for part in parts)
         if gain <= LEAST_GAIN:
             return Structure(names, gain, 0.0, 0.0, False)
         at, weight, knots = _basis(parts)
-        table, rows = np.zeros((len(at), knots)), self._task.rows
+        table, rows, e = np.zeros((len(at), knots)), self._task.rows, self._e
         np.put_along_axis(table, at, weight, axis=1)
-        white, e = self._freed(self._task.innovations(table)), self._e
+        white, table = self._task.innovations(table), table[rows]
+        for columns in np.array_split(white, 8, axis=1):  # all at once would need much memory
+            columns -= self._n @ (self._inverse @ (self._n.T @ columns))
         normal, toward = white.T @ white, white.T @ e
         ridge = self._likeliest(normal, toward)[1] * np.eye(knots)
-        function = table[rows] @ np.linalg.solve(normal + ridge, toward)
+        function = table @ np.linalg.solve(normal + ridge, toward)
         by_block = self._gains_of_blocks(white, e, ridge)
         spread = float(by_block.std(ddof=1)) * np.sqrt(len(by_block))
         sign = float(by_block.sum() / spread) if spread > 0.0 else 0.0
         # Whitening leaves little of what lasts, and the noise of a sensor is large beside that.
         seen = self._series[rows] - np.mean(self._series[rows])
-        explained = float(self._gains_of_blocks(table[rows], seen, ridge).sum()) / len(e)
+        explained = float(self._gains_of_blocks(table, seen, ridge).sum()) / len(e)
         return _judged(self._task, names, gain, sign, max(float(np.var(function)), explained))
 
     def _gains_of_blocks(
