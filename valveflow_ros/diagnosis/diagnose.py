@@ -412,7 +412,7 @@ def diagnose(
     rest = replace(_look_again(found), course=course, start_ns=found.task.grids.start_ns)
     rest = _withdraw(found, rest)
     _withdraw_small(found)  # what a withdrawn cause left to another one may be less
-    _, dropped = _verdict(found, rest, record_wrong=False)
+    _, dropped = _verdict(found, rest)
     if _BEND not in found.model.names or dropped:
         since = first  # what was left beside a bend holds only beside it
     if given and found.model.active and not dropped:
@@ -793,10 +793,10 @@ def _conclude(
         for a, gain in zip(final.active, gains, strict=True)
     )  # fmt: skip
     raw = record.grids(np.zeros(record.table.values.shape, dtype=bool)) if wrong else None
-    outside = actuator_cause(found) + record_causes(raw, found, wrong)
+    in_actuator, in_record = actuator_cause(found), record_causes(raw, found, wrong)
     changed, alike = (since, '') if isinstance(since, Change) else (None, since)
     earlier = () if changed is None else (changed.cause(found.task, models[0]),)
-    verdict, dropped = _verdict(found, rest, bool(earlier + outside))
+    verdict, dropped = _verdict(found, rest, bool(earlier + in_actuator), bool(in_record))
     near = tuple(dict.fromkeys(n for c in earlier + causes for n in c.not_told_apart))
     if verdict == UNEXPLAINED:
         near = tuple(dict.fromkeys((*(c.name for c in causes), *near)))
@@ -807,7 +807,7 @@ def _conclude(
     before, after = (rmse(found.task, m, grids.sealed_rows) for m in (simulation, extended))
     explained = rest.structure.explained_mw2 if rest.structure.there else 0.0
     result = Diagnosis(
-        verdict=verdict, sentence='', causes=earlier + causes + outside,
+        verdict=verdict, sentence='', causes=earlier + causes + in_actuator + in_record,
         not_told_apart=near, experiments=_experiments(earlier + causes),
         disturbance=rest.disturbance,
         unexplained_by=unexplained, unexplained_mw=unexplained_mw,
@@ -864,10 +864,13 @@ def _with_what_agrees(
     }
 
 
-def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str, bool]:
+def _verdict(
+    found: SearchResult, rest: _Rest, otherwise_named: bool = False, record_wrong: bool = False
+) -> tuple[str, bool]:
     """Return the verdict, and whether the names must be removed.
 
-    If the remaining structure exceeds what the causes explain, they are only approximate.
+    If the remaining structure exceeds what the causes explain, they are only approximate. Faults
+    of the record, whose rows are left out, explain no change in time of the others.
     """
     structure = rest.structure.explained_mw2 if rest.structure.there else 0.0
     left = max(structure, rest.period.variance_mw2 if rest.period.there else 0.0)
@@ -879,9 +882,11 @@ def _verdict(found: SearchResult, rest: _Rest, record_wrong: bool) -> tuple[str,
         )
         if not found.model.active or left > own:
             return UNEXPLAINED, bool(found.model.active)
-    if found.model.active or record_wrong:
+    if found.model.active or otherwise_named:
         return NAMED, False
-    return (NOTHING if rest.course is None else UNEXPLAINED), False
+    if rest.course is not None:
+        return UNEXPLAINED, False
+    return (NAMED if record_wrong else NOTHING), False
 
 
 _THE_TIME = 'the time'
