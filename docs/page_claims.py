@@ -52,7 +52,7 @@ _SMALL = 'diagnosis_hidden_55340_55341_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
     'every second': 'thermal_names_1s_96201_96208',
-    'means over a minute': 'thermal_names_minute_96001_96017',
+    'means over a minute': 'thermal_names_minute_95001_95017',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
 }
 _KIND_WORDS = {
