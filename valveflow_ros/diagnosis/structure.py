@@ -70,8 +70,8 @@ class Structure:
     sign : float
         t value of the gains of blocks, each from a fit to others: mean divided by standard error.
     explained_mw2 : float
-        Variance of the function, which the prior makes smaller, or, if larger, what its fit to
-        other blocks explains in MW^2.
+        Variance of the residual times the share of the innovations that follows the function or,
+        if larger, what its fit to other blocks explains in MW^2.
     there : bool
         It is significant, and large enough to be a fault.
     """
@@ -138,7 +138,8 @@ def structure(
     screening : Screening
         Of this model.
     wandering : float64 (m,), optional
-        A slow disturbance in MW, which is subtracted first; the time is no variable then.
+        A slow disturbance in MW, which is subtracted first; the time is no variable then, nor
+        the time of day alone.
     """
     series, values = task.residual(model), variables(task, model)
     over_hours = {name: values[name] for name in _SLOW}
@@ -149,7 +150,10 @@ def structure(
     least = LEAST_GAIN if wandering is None else _BESIDE_WANDER
     test = _FunctionTest(task, nuisance, series, least)
     smooth = {name: _smooth(name, x, task) for name, x in values.items()}
-    functions = _functions(smooth, task.rows)
+    functions = [
+        parts for parts in _functions(smooth, task.rows)
+        if wandering is None or {part.variable for part in parts} != {'time of day'}
+    ]  # fmt: skip
     left = test.best(functions, each_in_threads(test.gain, functions))
     if left.there:
         return left
@@ -401,14 +405,15 @@ class _FunctionTest:
             columns -= self._n @ (self._inverse @ (self._n.T @ columns))
         normal, toward = white.T @ white, white.T @ e
         ridge = self._likeliest(normal, toward)[1] * np.eye(knots)
-        function = table @ np.linalg.solve(normal + ridge, toward)
+        told = white @ np.linalg.solve(normal + ridge, toward)
         by_block = self._gains_of_blocks(white, e, ridge)
         spread = float(by_block.std(ddof=1)) * np.sqrt(len(by_block))
         sign = float(by_block.sum() / spread) if spread > 0.0 else 0.0
-        # Whitening leaves little of what lasts, and the noise of a sensor is large beside that.
+        # As a share of the innovations. Whitening leaves little of what lasts.
         seen = self._series[rows] - np.mean(self._series[rows])
+        share = float(np.mean(told**2) / np.mean(e**2) * np.mean(seen**2))
         explained = float(self._gains_of_blocks(table, seen, ridge).sum()) / len(e)
-        return _judged(self._task, names, gain, sign, max(float(np.var(function)), explained))
+        return _judged(self._task, names, gain, sign, max(share, explained))
 
     def _gains_of_blocks(
         self, columns: FloatArray, y: FloatArray, ridge: FloatArray
