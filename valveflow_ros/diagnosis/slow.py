@@ -458,10 +458,12 @@ def of_causes(model: Extended, names: Sequence[str]) -> tuple[str, ...]:
 def wander_lead(task: Task, model: Extended) -> float:
     """Return by how much a slow disturbance exceeds the causes in time, on the rows of the fit.
 
-    One `curve_step` alone does not count: it also depends on the load.
+    It is 0 with intervals, whose times are found anew when all blocks count, and with one
+    `curve_step` alone, which also depends on the load.
     """
     names = [name for name in model.names if name in LEVELS]
-    tried = {} if names == ['curve_step'] else courses(task, model, names, task.rows)
+    no_level = 'intervals' in names or names == ['curve_step']
+    tried = {} if no_level else courses(task, model, names, task.rows)
     mine = [tried[shape].score for shape in of_causes(model, names) if shape in tried]
     return tried[NO_SHAPE].score - max(mine) if mine else 0.0
 
