@@ -83,10 +83,10 @@ class Structure:
     there: bool
 
 
-def _judged(
+def _sized(
     task: Task, variables: tuple[str, ...], gain: float, sign: float, explained_mw2: float
 ) -> Structure:
-    """Return a dependence whose gain is large enough."""
+    """Return a dependence whose gain is large enough; its size and sign decide if it counts."""
     there = sign > LEAST_SIGN and explained_mw2 > (_LEAST_MW * task.grids.size) ** 2
     return Structure(variables, gain, sign, explained_mw2, there)
 
@@ -200,7 +200,7 @@ def _over_hours(task: Task, model: Extended, values: dict[str, FloatArray]) -> S
     hats = found.free[:, places[k]]
     noise = np.einsum('ki,ij,kj->k', hats, fits[k].covariance, hats)
     explained = float(np.var(hats @ fits[k].coefficients) - noise.mean())
-    return _judged(task, (list(columns)[k],), gain, float('inf'), explained)
+    return _sized(task, (list(columns)[k],), gain, float('inf'), explained)
 
 
 def likelier_over_hours(task: Task, model: Extended, effect: FloatArray, size: int) -> str:
@@ -413,7 +413,7 @@ class _FunctionTest:
         seen = self._series[rows] - np.mean(self._series[rows])
         share = float(np.mean(told**2) / np.mean(e**2) * np.mean(seen**2))
         explained = float(self._gains_of_blocks(table, seen, ridge).sum()) / len(e)
-        return _judged(self._task, names, gain, sign, max(share, explained))
+        return _sized(self._task, names, gain, sign, max(share, explained))
 
     def _gains_of_blocks(
         self, columns: FloatArray, y: FloatArray, ridge: FloatArray
