@@ -124,6 +124,17 @@ def test_an_answer_is_the_same_whatever_was_asked_before(grids):
     assert np.abs(answer(used, path) - answer(used, free))[grids.scored].max() > 0.01
 
 
+def test_a_piece_that_only_sealed_blocks_visit_stays_as_it_is(grids):
+    model, u = rough_model(), grids.means(grids.u)
+    plain = Extended(model)
+    task = Task(grids, grids.open_rows & (u > model.knots[2] + 20.0), np.zeros(ORDER))
+    # By the lags, the rows above tell something of the pieces below, but not enough.
+    found, cost = improve(task, plain, 12)
+    assert cost < 0.95 * task.cost(plain)
+    assert found.base.left[0] == model.left[0]
+    assert found.base.left[1] == pytest.approx(model.left[1], abs=15.0)
+
+
 @pytest.mark.parametrize('name', sorted(NAMES))
 def test_tangents_of_causes_predict_small_changes(grids, name):
     cause = catalogue()[name]
