@@ -330,7 +330,7 @@ _SHAPES = {
     ('drift', 'drift'): ('drift',),
 }  # fmt: skip
 # Gain in log-likelihood by which another shape must exceed one cause; for several it is 0.
-ANOTHER_SHAPE = 6.0
+ANOTHER_SHAPE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
