@@ -74,8 +74,10 @@ def _crossed(task: Task, model: Extended) -> FloatArray:
 _LAGS = 3
 _RIDGE = 1e-4  # of the squared norm of a column
 _MEMORY_S = 1200.0
-LEAST_GAIN, LEAST_SIGN = 16.0, 1.0
-_WALD_LEVEL, _WALD_EACH = 10.0, 5.0
+# Fixed on the healthy plants 72000 to 72059 of `benchmarks.diagnosis_study`, of which one passed.
+# What passes is tested on the sealed blocks besides.
+LEAST_GAIN, LEAST_SIGN = 8.0, 1.0
+_WALD_LEVEL, _WALD_EACH = 7.0, 4.0
 
 
 def _by_block(task: Task, table: FloatArray) -> tuple[FloatArray, np.ndarray]:
