@@ -25,7 +25,7 @@ from valveflow_ros.diagnosis.fitting import (
 )
 from valveflow_ros.diagnosis.grids import DAY_S, Grids
 from valveflow_ros.diagnosis.screening import EDGE_SHARE, Screening
-from valveflow_ros.diagnosis.slow import ANOTHER_SHAPE, LEVELS, OF_WANDER, wander_lead
+from valveflow_ros.diagnosis.slow import LEVELS, OF_WANDER, wander_lead
 from valveflow_ros.errors import TooFewSamplesError, listed
 from valveflow_ros.fit.problem import Samples
 from valveflow_ros.fit.refine import search as search_plain
@@ -143,6 +143,8 @@ NOT_TOLD_APART = 10.0
 # physics with numbers 5001 to 5012.
 _LEAST_HEIGHT = 0.0025
 KEPT_LEAST = 8.0
+# In log-likelihood; a random variation also imitates causes that are not found yet.
+_LEAD_OF_WANDER = 6.0
 _SAME_COST = 0.999  # a smaller part of the sum of squares is another minimum of the same model
 _LEAST_EXCHANGE = 1.0  # log-likelihood: less is no reason to fit everything again
 STRONG = 300.0  # log-likelihood of a cause that may have made the identification wrong
@@ -703,7 +705,7 @@ def _doubt(task: Task, rival: Rival) -> str:
 
 def _like_a_wander(task: Task, rival: Rival) -> str:
     """Return why a change in time is none: a slow disturbance fits better; or ''."""
-    if rival.added.name not in LEVELS or wander_lead(task, rival.model) <= ANOTHER_SHAPE:
+    if rival.added.name not in LEVELS or wander_lead(task, rival.model) <= _LEAD_OF_WANDER:
         return ''
     return OF_WANDER
 
