@@ -53,8 +53,9 @@ _SLOW_HATS = 5
 # daily cycles of `benchmarks.diagnosis_study` (55320 to 62400) did by 15 to 55. The effect of the
 # load of hours before, seed 62600, was named a daily cycle that did by 2. And the part that both
 # explain, beside a dependence that explains as much more: for 12 true daily cycles and five drifts
-# and steps (67400 to 67503) it was at most 5.0, and for that effect (62600 to 67601) 8 to 17.
-_LEAD = 5.0
+# and steps (67400 to 67503) it was at most 5.0 or 18 %, and for that effect (62600 to 67601) 8 to 17
+# or 50 to 90 % of the gain of the cause.
+_LEAD, _SHARED = 5.0, 0.33
 _IN_THREES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 _FINE, _BESIDE = ('u', 'opening', 'pressure'), ('pressure given u', 'temperature', 'ramp')
 _INERT = ('temperature', 'temperature change')
@@ -238,8 +239,9 @@ def likelier_over_hours(task: Task, model: Extended, effect: FloatArray, size: i
         list(columns)[1:], places[1:], alone[1:], together, strict=True
     ):
         beyond = gain - len(place) * paid
-        # Each explains more than the other, and a part that both explain may be of either.
-        shared = alone[0] + gain - of_both > _LEAD and of_both - alone[0] > _LEAD
+        # It explains more than the cause, and much of what the cause explains.
+        both_explain = alone[0] + gain - of_both
+        shared = both_explain > max(_LEAD, _SHARED * alone[0]) and of_both - alone[0] > _LEAD
         if beyond > max(best[1], 0.0 if shared else own):
             best = (name, beyond)
     return best[0]
