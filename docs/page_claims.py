@@ -46,13 +46,13 @@ _COVERAGE = {
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_67400_67402', 'null_68000_68099'
-_PAIRS, _TRIPLES = 'pair_67500_67503', 'triple_67310_67314'
+_HIDDEN, _NULL = 'hidden_74400_74402', 'null_68000_68099'
+_PAIRS, _TRIPLES = 'pair_74600_74603', 'triple_74500_74504'
 _SMALL = 'diagnosis_hidden_55340_55341_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
-    'every second': 'thermal_names_1s_96201_96208',
-    'means over a minute': 'thermal_names_minute_95001_95017',
+    'every second': 'thermal_names_1s_97501_97508',
+    'means over a minute': 'thermal_names_minute_97601_97617',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
 }
 _KIND_WORDS = {
@@ -173,16 +173,16 @@ def _diagnosis() -> list[Row]:
     for name, question in (
         (_HIDDEN, 'one hidden effect: named, and no other'),
         (_NULL, 'nothing wrong: nothing named, and nothing said to be unexplained'),
-        ('slow_67700_67703',
+        ('slow_74700_74703',
          'a slow change of 1 to 2 % in a shape that no cause has (two steps, fouling, late '
          'drift, drift then wash, random walk, two changes over hours; an offset that switches '
          'may be named): told as a change in time, and nothing named'),
         ('confounded_47300_47303', 'two causes that look alike'),
         (_PAIRS, 'two causes at once: both named'),
         (_TRIPLES, 'three causes at once: all named'),
-        ('outside_67600_67602',
+        ('outside_74300_74302',
          "effects outside the catalogue, with a quarter of the noise's sd: none named"),
-        ('outside_67650_67652',
+        ('outside_74350_74352',
          "effects outside the catalogue, with 0.15 of the noise's sd: none named"),
     ):  # fmt: skip
         r = result(f'diagnosis_{name}_5d')
