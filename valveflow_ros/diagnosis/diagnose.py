@@ -281,7 +281,7 @@ _FULL_LOAD = 0.9  # quantile of the power
 # Part of a slow disturbance that a temperature may contain, as 95 % limit: fixed on units with
 # numbers 1401 to 1406.
 _AGREES = 0.1
-# The same of the error of the form, which healthy plants have, as a part of the range of the power,
+# The same of the error of the form, which healthy plants have, as a part of the range of power,
 # for units built from physics in means over a minute: fixed on the units 4101 to 4112.
 _AGREES_OWN = 0.0003
 _ACTS = 0.05  # fraction of the largest change below which there is no effect

@@ -53,8 +53,8 @@ _SLOW_HATS = 5
 # daily cycles of `benchmarks.diagnosis_study` (55320 to 62400) did by 15 to 55. The effect of the
 # load of hours before, seed 62600, was named a daily cycle that did by 2. And the part that both
 # explain, beside a dependence that explains as much more: for 12 true daily cycles and five drifts
-# and steps (67400 to 67503) it was at most 5.0 or 18 %, and for that effect (62600 to 67601) 8 to 17
-# or 50 to 90 % of the gain of the cause.
+# and steps (67400 to 67503) it was at most 5.0 or 18 %, and for that effect (62600 to 67601) 8 to
+# 17 or 50 to 90 % of the gain of the cause.
 _LEAD, _SHARED = 5.0, 0.33
 _IN_THREES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 _FINE, _BESIDE = ('u', 'opening', 'pressure'), ('pressure given u', 'temperature', 'ramp')
