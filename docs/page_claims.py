@@ -232,7 +232,7 @@ def _at_best(r: dict[str, Any]) -> str:
     share = best['share']
     return (
         f'; right but for one name whose true one is listed as not told apart from it: '
-        f'{sum(map(_listed, r["rows"]))} more; where each true cause gains at least 16 in '
+        f'{sum(map(_listed, r["rows"]))} more; where each true cause gains at least 8 in '
         f'log-likelihood beside the others: {best["right"]} of {best["records"]} right, in '
         f'{best["wrong_and_likelier"]} of the others what was named fits better than the truth; '
         f'in records answered rightly, reduction of the squared error on held-out blocks relative '

@@ -191,7 +191,7 @@ def _variance(white: FloatArray) -> float:
     return max(float(np.median(np.median(squares, axis=1))) / _OF_NORMAL, 1e-12)
 
 
-# Of the range of the curve: a value that the rows do not determine better, stays.
+# Of the range of the curve. A value of the curve stays if its standard error would be larger.
 _LEAST_KNOWN = 0.02
 _LEVEL_STEPS_MW = (6.0, 3.0, 1.5, 0.8, 0.4)
 _LINE_SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
@@ -426,9 +426,9 @@ def improve(
         normal = np.block([[sums, across], [across.T, causes.T @ causes]])
         slope = np.append(base.T @ rest, causes.T @ rest)
         # A piece that only the sealed blocks visit would otherwise become anything.
-        values = np.concatenate([model.base.left, model.base.right])
-        least = float(rest @ rest) / len(rest) / (_LEAST_KNOWN * float(np.ptp(values))) ** 2
-        unknown = np.flatnonzero(np.diag(normal)[: model.base.pieces + 1] < least)
+        error = _LEAST_KNOWN * np.ptp(np.concatenate([model.base.left, model.base.right]))
+        known = np.diag(normal)[: model.base.pieces + 1] * error**2 * len(rest)
+        unknown = np.flatnonzero(known < rest @ rest)
         normal[unknown], normal[:, unknown], slope[unknown] = 0.0, 0.0, 0.0
         return within_reach(
             model.base, base_mask(task, model), normal, slope, task.grids.step_s

@@ -216,11 +216,19 @@ class SearchResult:
     refuted: set[str] = field(default_factory=set)
     trials: Trials | None = None
 
+    def without(self, name: str) -> Extended:
+        """Return the model without a cause, fitted again.
+
+        Beside a cause that is a lag, the other lags are far from their best without it. So the fit
+        begins with the curve and lags of the plain model too.
+        """
+        others = self.model.without(name)
+        begin = (others, replace(self.plain, active=others.active))
+        return min((improve(self.task, m, 3) for m in begin), key=lambda fit: fit[1])[0]
+
     def withdraw(self, name: str, why: str, model: Extended | None = None) -> None:
         """Remove a cause; ``model`` is the one without it, which is fitted here if not given."""
-        if model is None:
-            model, _ = improve(self.task, self.model.without(name), 3)
-        self.model = model
+        self.model = self.without(name) if model is None else model
         self.near.pop(name, None)
         self.evidence.pop(name, None)
         self.reasons[name] = why

@@ -52,9 +52,9 @@ _SLOW_HATS = 5
 # Log-likelihood by which a cause in time must exceed a dependence on the load of hours: seven true
 # daily cycles of `benchmarks.diagnosis_study` (55320 to 62400) did by 15 to 55. The effect of the
 # load of hours before, seed 62600, was named a daily cycle that did by 2. And the part that both
-# explain, beside a dependence that explains as much more: for 12 true daily cycles and five drifts
-# and steps (67400 to 67503) it was at most 5.0 or 18 %, and for that effect (62600 to 67601) 8 to
-# 17 or 50 to 90 % of the gain of the cause.
+# explain, beside a dependence that explains as much more: for 11 true daily cycles and nine drifts
+# and steps (67310 to 67503) it was at most 5.5 or 21 % of the gain of the cause, and for that
+# effect (62600 to 67601) 11 to 17 or 50 to 90 %.
 _LEAD, _SHARED = 5.0, 0.33
 _IN_THREES = ('u', 'pressure given u', 'temperature', 'ramp', 'opening')
 _FINE, _BESIDE = ('u', 'opening', 'pressure'), ('pressure given u', 'temperature', 'ramp')
