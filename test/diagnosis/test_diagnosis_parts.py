@@ -135,6 +135,16 @@ def test_a_piece_that_only_sealed_blocks_visit_stays_as_it_is(grids):
     assert found.base.left[1] == pytest.approx(model.left[1], abs=15.0)
 
 
+def test_a_model_without_a_lag_is_not_worse_than_the_plain_model(grids):
+    task = Task(grids, grids.open_rows, np.zeros(ORDER))
+    plain, cost = improve(task, Extended(rough_model()), 12)
+    reheater = FittedCause(catalogue()['reheater'], TYPICAL['reheater'])
+    # Lags that suit the model with the reheater only: three steps do not lead back from them.
+    far = replace(plain.base, time_constants=np.array([400.0, 0.5]))
+    found = SearchResult(task, Extended(far).with_cause(reheater), plain, plain)
+    assert task.cost(found.without('reheater')) <= cost
+
+
 @pytest.mark.parametrize('name', sorted(NAMES))
 def test_tangents_of_causes_predict_small_changes(grids, name):
     cause = catalogue()[name]
@@ -440,6 +450,14 @@ def test_what_follows_the_load_of_hours_before_is_told_from_a_wander(seed):
         assert not there or HOURS_BEFORE in found.variables
         # A plant with a daily programme repeats it each day.
         assert bool(likelier_over_hours(task, plain, daily, 2)) == there
+    # A cause that moves with the load of hours before, alone and beside more of that load.
+    load, other = np.sign(x - np.median(x)), rng.permutation(np.repeat([-1.0, 1.0], 24))
+    cause = 1.5 * load + np.repeat(other, -(-len(x) // 48))[: len(x)]
+    for of_cause, of_load in ((0.8, 0.0), (0.3, 0.8)):
+        power = answer(grids, plain) + noise + of_cause * cause + of_load * load
+        task = replace(task, grids=replace(grids, power=power))
+        told = likelier_over_hours(task, plain, cause, 1)
+        assert told == (HOURS_BEFORE if of_load else '')
     task = replace(task, grids=replace(grids, power=answer(grids, plain) + noise + 2.0 * daily))
     assert likelier_over_hours(task, plain, daily, 2) == ''
 
