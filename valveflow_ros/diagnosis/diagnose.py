@@ -263,9 +263,9 @@ _LEAST_SPREAD = 0.01
 _FAR_MORE = 8.0
 _OWN_MISFIT = 0.004  # of the range of the power
 # Root mean square, of the same range. The valves, the turbine and the sensors of a unit built from
-# physics are no lags and straight pieces. 0.001 was fixed on units with numbers 88001 to 88040, by a
-# worse fit without the cause; two true exponents of `benchmarks.diagnosis_study` explained 0.00096
-# (67311 and 67502).
+# physics are no lags and straight pieces. 0.001 was fixed on units with numbers 88001 to 88040,
+# by a worse fit without the cause; two true exponents of `benchmarks.diagnosis_study` explained
+# 0.00096 (67311 and 67502).
 _LEAST_EXPLAINED = 0.0007
 # A slack shows at reversals only, where the straight pieces of a healthy valve matter less: fixed
 # on the sets 88001 and 89001 of `benchmarks.naming`, where false ones explained up to 0.0003.
