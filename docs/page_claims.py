@@ -46,13 +46,13 @@ _COVERAGE = {
 _RIVALS = 'compare_study_paper_1_5'
 _RUN_LENGTH = 'alarm_run_length_6100_6129'
 _HEALTHY, _FAULTY = 'monitor_healthy_441_448', 'monitor_all_times_3_451_453'
-_HIDDEN, _NULL = 'hidden_74400_74402', 'null_68000_68099'
+_HIDDEN, _NULL = 'hidden_75400_75402', 'null_75800_75899'
 _PAIRS, _TRIPLES = 'pair_74600_74603', 'triple_74500_74504'
 _SMALL = 'diagnosis_hidden_55340_55341_5d'
 _MINUTE = 'diagnosis_hidden_minute_38200_38219_5d'
 _NAMES = {
-    'every second': 'thermal_names_1s_97501_97508',
-    'means over a minute': 'thermal_names_minute_97601_97617',
+    'every second': 'thermal_names_1s_98501_98508',
+    'means over a minute': 'thermal_names_minute_98601_98617',
     'compressed by exception': 'thermal_names_compressed_3301_3308',
 }
 _KIND_WORDS = {
